@@ -729,6 +729,14 @@ def write_atomically(path: Path, write) -> None:
         os.close(directory)
 
 
+def save_tensors(content: dict, file) -> None:
+    """torch.save, whose RuntimeError for a write that the disk refused is made the OSError that it hides."""
+    try:
+        torch.save(content, file)
+    except RuntimeError as error:
+        raise error.__context__ if isinstance(error.__context__, OSError) else OSError(str(error)) from None
+
+
 def write_json(path: Path, content: dict) -> None:
     """Atomically write an indented JSON file."""
     write_atomically(path, lambda file: file.write((json.dumps(content, indent=2) + "\n").encode()))
@@ -781,13 +789,14 @@ def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tupl
     indices = np.empty((length, len(history) + 1), np.int32)
     for i, codes in enumerate(replay.frames[:length]):
         indices[i] = number(codes)
+    now = number(history)
     columns = {"indices": indices, "actions": replay.actions[:length], "rewards": replay.rewards[:length],
                "terminals": replay.terminals[:length], "lengths": np.fromiter(map(len, blobs), np.int32)}
-    state = state | {"format": CHECKPOINT_FORMAT, "history": number(history), "added": replay.added,
+    state = state | {"format": CHECKPOINT_FORMAT, "history": now, "added": replay.added,
                      "replay": {name: torch.from_numpy(column) for name, column in columns.items()}}
 
     def write(file) -> None:
-        torch.save(state, file)
+        save_tensors(state, file)
         with zipfile.ZipFile(file, "a") as archive, archive.open("archive/frames", "w", force_zip64=True) as member:
             for start in range(0, len(blobs), 4096):
                 member.write(b"".join(blobs[start : start + 4096]))
@@ -814,14 +823,28 @@ def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
         raise ValueError(f"{path} cannot be resumed from: {reason}") from None
 
 
-def restore_replay(replay: ReplayMemory, state: dict, codes: list) -> None:
-    """Fill `replay` with what `save_checkpoint` took from it; `codes` are its frames, encoded for `replay`."""
-    replay.added = state["added"]
-    columns = {name: column.numpy() for name, column in state["replay"].items()}
-    for i, row in enumerate(columns["indices"].tolist()):
-        replay.frames[i] = tuple(codes[number] for number in row)
-    for name in ("actions", "rewards", "terminals"):
-        getattr(replay, name)[: len(replay)] = columns[name]
+def restore_run(saved: dict, codes: list, replay: ReplayMemory, env: gym.Env, generators: list, learnt: dict) -> tuple:
+    """Put everything where the checkpoint was taken; `codes` are its frames, encoded for `replay`. Returns the state.
+    Raises ValueError, with the part's name, for a part that does not fit."""
+    part = "replay"
+    try:
+        columns = {name: column.numpy() for name, column in saved["replay"].items()}
+        replay.added = saved["added"]
+        for i, row in enumerate(columns["indices"].tolist()):
+            replay.frames[i] = tuple(codes[number] for number in row)
+        for name in ("actions", "rewards", "terminals"):
+            getattr(replay, name)[: len(replay)] = columns[name]
+        state = tuple(codes[number] for number in saved["history"])
+        part = "environment"
+        restore_environment(env, saved["environment"], state)
+        for part, of_part in learnt.items():
+            of_part.load_state_dict(saved[part])
+        part = "generators"
+        for generator, generator_state in zip(generators, saved["generators"], strict=True):
+            generator.bit_generator.state = generator_state
+    except Exception as error:  # whatever it is, it is no reason to go on from half a state
+        raise ValueError(f"its {part} does not fit ({str(error).splitlines()[0]})") from None
+    return state
 
 
 def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
@@ -949,7 +972,6 @@ def main(args: Args) -> None:
     if (run_dir / "test.json").exists() and counters.frames >= args.environment_train_frames_max:
         print(f"{run_dir} has finished its {counters.frames:,} frames; --environment-train-frames-max trains on")
         return
-    write_json(run_dir / "args.json", vars(args))
 
     # 1  Initialize the Atari 2600 simulator.
     shape = args.environment_state_height, args.environment_state_width
@@ -971,17 +993,16 @@ def main(args: Args) -> None:
     target_network.layers.to(precision)  # the head stays float32: Q keeps more than bfloat16's three digits
 
     if saved:
-        codes = [from_bytes(blob, encoding_name, shape, encode) for blob in blobs]
-        state = tuple(codes[number] for number in saved["history"])
-        restore_replay(replay, saved, codes)
-        restore_environment(env, saved["environment"], state)
-        for part, name in ((q_network, "q_network"), (target_network, "target_network"), (optimizer, "optimizer")):
-            part.load_state_dict(saved[name])
-        for generator, generator_state in zip(generators, saved["generators"], strict=True):
-            generator.bit_generator.state = generator_state
-        del blobs, codes, saved
+        learnt = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
+        codes = (from_bytes(blob, encoding_name, shape, encode) for blob in blobs)
+        try:
+            state = restore_run(saved, list(codes), replay, env, generators, learnt)
+        except ValueError as error:
+            fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
+        del saved, blobs
     else:
         state, _ = env.reset(seed=args.seed)
+    write_json(run_dir / "args.json", vars(args))
 
     print(f"game     {args.env_id}: {len(actions)} actions, {' '.join(actions)}\n"
           f"device   {device}, {torch.get_num_threads()} threads; updates in {str(precision).removeprefix('torch.')}\n"
@@ -1019,7 +1040,7 @@ def main(args: Args) -> None:
             "target_network": target_network.state_dict(), "optimizer": optimizer.state_dict(),
             "counters": dataclasses.asdict(counters), "environment": environment_state(env),
             "generators": [generator.bit_generator.state for generator in generators]}
-        attempt("q_network.pt", lambda: write_atomically(run_dir / "q_network.pt", lambda f: torch.save(weights, f)))
+        attempt("q_network.pt", lambda: write_atomically(run_dir / "q_network.pt", lambda f: save_tensors(weights, f)))
         attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
@@ -1040,9 +1061,10 @@ def main(args: Args) -> None:
                 attempt("evaluations.csv", lambda: write_csv(run_dir / "evaluations.csv", counters.evaluation_rows))
                 columns = ("score_mean", "score_variance", "length_mean")
                 curves.add({f"evaluation/{name}": row[name] for name in columns}, counters.frames)
-                tqdm.write(f"evaluation {counters.evaluations} at frame {counters.frames:,}, update "
-                           f"{counters.updates:,}, episode {counters.episodes:,}: score {row['score_mean']:.2f} (variance "
-                           f"{row['score_variance']:.4g}), length {row['length_mean']:.1f} frames")
+                tqdm.write(f"evaluation {counters.evaluations} at frame {counters.frames:,}, "
+                           f"update {counters.updates:,}, episode {counters.episodes:,}: "
+                           f"score {row['score_mean']:.2f} (variance {row['score_variance']:.4g}), "
+                           f"length {row['length_mean']:.1f} frames")
         if stop.signum:
             break
         if (counters.episodes - counters.checkpoint_episodes >= args.environment_checkpoint_interval_episodes

@@ -1,0 +1,81 @@
+"""Resident memory of dqn_atari.py's replay memory, filled by random play of the five games of Table 5.
+
+    python benchmarks/replay_memory.py                             # 100,000 transitions a game, scaled to a million
+    python benchmarks/replay_memory.py --transitions 1000000 --games SpaceInvaders
+
+One process a game. Resident memory is what the operating system counts for the process (RSS), after less before:
+frames, references, actions, rewards and whatever Python and the allocator add. Beside it stand the lecture's figure
+(§7.3.2), one raw 84×84 frame a transition, and what CleanRL (one stack of four frames) and Stable-Baselines3 (two
+stacks) allocate.
+"""
+
+import dataclasses
+import gc
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+import tyro
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
+
+
+@dataclasses.dataclass
+class Args:
+    transitions: int = 100_000
+    """Transitions to store."""
+    games: tuple[str, ...] = ("Breakout", "Enduro", "Pong", "Riverraid", "SpaceInvaders")
+    """Games to play."""
+    worker: bool = False
+    """Used by the benchmark itself: measure one game in this process."""
+
+
+def fill(game: str, transitions: int) -> int:
+    """Bytes of resident memory that `transitions` of random play take."""
+    import dqn_atari as dqn
+
+    args = dqn.Args(env_id=f"{game}NoFrameskip-v4")
+    rng = np.random.default_rng(0)
+    encode, decode = dqn.frame_encoding("lz4", 84, 84, torch.device("cpu"))
+    env = dqn.preprocess(dqn.make_emulator(args.env_id), args, encode, rng, training=True)
+    state, _ = env.reset(seed=1)
+    for _ in range(100):  # the emulator's own memory is not the replay's
+        if any(env.step(0)[2:4]):
+            env.reset()
+    state, _ = env.reset()
+    gc.collect()
+    before = psutil.Process().memory_info().rss
+    memory = dqn.ReplayMemory(transitions, decode)
+    for _ in tqdm(range(transitions), desc=game, unit="frame", unit_scale=True):
+        action = int(rng.integers(env.action_space.n))
+        next_state, reward, terminated, truncated, _ = env.step(action)
+        memory.add(state, action, reward, next_state, terminated)
+        state = env.reset()[0] if terminated or truncated else next_state
+    gc.collect()
+    return psutil.Process().memory_info().rss - before
+
+
+def main(args: Args) -> None:
+    """Measure each game in a process of its own and print the table."""
+    if args.worker:
+        print(json.dumps(fill(args.games[0], args.transitions)))
+        return
+    print(f"{args.transitions:,} transitions a game\n")
+    print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
+    for game in args.games:
+        done = subprocess.run([sys.executable, __file__, "--worker", "--games", game, "--transitions",
+                               str(args.transitions)], stdout=subprocess.PIPE, check=True, text=True)
+        each = json.loads(done.stdout.splitlines()[-1]) / args.transitions
+        print(f"{'dqn_atari.py, ' + game:<44}{each / 1e3:>10.2f}{each:>12.0f}", flush=True)
+    for name, each in (("one raw frame (Nature, Dopamine)", 84 * 84), ("the lecture (§7.3.2)", 11_000),
+                       ("CleanRL: a stack of 4", 4 * 84 * 84), ("Stable-Baselines3: two stacks of 4", 8 * 84 * 84)):
+        print(f"{name:<44}{each / 1e3:>10.2f}{each:>12,}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

@@ -1,0 +1,99 @@
+"""What holds across the scripts: each stands alone, says the same thing in the same words, and installs as it says."""
+
+import ast
+import itertools
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parent.parent
+SCRIPTS = sorted((ROOT / "algorithms").glob("*.py"))
+OWN = {"Args", "main"}  # each script's own
+ROOMS = ["Args", "problem", "memory", "network", "algorithm", "evaluation", "report and checkpoint", "main"]
+
+
+def definitions(path: Path) -> dict[str, str]:
+    """Source of every top-level class and function, by name."""
+    source = path.read_text(encoding="utf-8")
+    return {node.name: "".join(ast.unparse(d) for d in node.decorator_list) + ast.get_source_segment(source, node)
+            for node in ast.parse(source).body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+
+
+def pep_723_block(path: Path) -> list[Requirement]:
+    """The dependencies of a script's own block (PEP 723)."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    start = lines.index("# /// script")
+    block = "\n".join(line[2:] for line in lines[start + 1 : lines.index("# ///", start)])
+    assert 'requires-python = ">=3.10"' in block
+    return [Requirement(text) for text in re.findall(r'"([^"]+)"', block.split("dependencies")[1])]
+
+
+def pinned() -> dict[str, str]:
+    """requirements.txt: name and version; every line says why."""
+    lines = (ROOT / "requirements.txt").read_text().splitlines()
+    assert all(re.fullmatch(r"[\w.-]+==\S+ +# \S.*", line) for line in lines), lines
+    return {name.lower(): version for name, version in (line.split()[0].split("==") for line in lines)}
+
+
+def test_same_name_same_source():
+    first = {}
+    for path in SCRIPTS:
+        for name, source in definitions(path).items():
+            if name not in OWN:
+                owner, expected = first.setdefault(name, (path.name, source))
+                assert source == expected, f"{name} differs between {owner} and {path.name}"
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+class TestEveryScript:
+    def test_its_requirements_are_pinned(self, path):
+        versions = pinned()
+        for requirement in pep_723_block(path):
+            assert requirement.specifier.contains(versions[requirement.name.lower()]), requirement
+
+    def test_it_imports_what_it_says_and_no_other_script(self, path):
+        modules = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                modules.add(node.module.split(".")[0])
+        assert not modules & {script.stem for script in SCRIPTS}
+        known_as = {"cv2": "opencv-python-headless", "ale_py": "ale-py"}
+        named = {requirement.name.lower() for requirement in pep_723_block(path)}
+        assert {known_as.get(m, m) for m in modules if m not in sys.stdlib_module_names} <= named
+
+    def test_its_rooms_stand_in_order(self, path):
+        banners = re.findall(r"^# ---- ([^:\n]*?)(?::.*)? -{3,}$", path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert banners == [room for room in ROOMS if room in banners], banners
+        assert {"Args", "algorithm", "main"} <= set(banners)
+
+    def test_public_names_have_docstrings(self, path):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        assert ast.get_docstring(tree)
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                assert ast.get_docstring(node), node.name
+
+    def test_every_flag_has_a_docstring(self, path):
+        (args,) = (node for node in ast.parse(path.read_text(encoding="utf-8")).body
+                   if isinstance(node, ast.ClassDef) and node.name == "Args")
+        for node, after in itertools.pairwise(args.body):
+            if isinstance(node, ast.AnnAssign):
+                assert isinstance(after, ast.Expr) and isinstance(after.value.value, str), ast.unparse(node)
+
+
+def test_readme_names_every_script():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for path in SCRIPTS:
+        assert f"algorithms/{path.name}" in readme
+
+
+def test_readme_commands_are_the_ones_that_ci_runs():
+    """.ci/run takes the test command out of the README; it must find exactly one."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(re.findall(r"^.*python -m pytest.*$", readme, re.MULTILINE)) == 1
+    assert "python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4" in readme
