@@ -49,13 +49,13 @@ class Args:
     """episodes to learn from (the lecture's Figure 9: 1000)"""
     discount: float = 1.0
     """γ in [0, 1], weight of a reward one step later (Equation 34 is undiscounted: 1)"""
-    learning_rate: float = 0.4
+    learning_rate: float = 0.7
     """α of a pair's first visit, in (0, 1] (Equation 34)"""
-    learning_rate_exponent: float = 0.75
+    learning_rate_exponent: float = 0.85
     """ω in [0, 1] of α = learning_rate · N(s,a)^-ω, where N(s,a) counts the visits of the pair; 0 keeps α constant"""
     epsilon_initial: float = 1.0
     """ε_initial in [0, 1], chance of a random action in the first episode (Algorithm 5, line 1)"""
-    epsilon_final: float = 0.3
+    epsilon_final: float = 0.7
     """ε_final in [0, 1], where annealing ends (Algorithm 5, line 10)"""
     epsilon_annealing: float = 1.0
     """share of the episodes, in [0, 1], over which ε falls linearly from ε_initial to ε_final"""
