@@ -38,6 +38,8 @@ Flags = TypeVar("Flags")
 
 @dataclass
 class Args:
+    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in sweeps over all states."""
+
     mdp: Path | None = None
     """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
     env_id: str = ""
@@ -96,7 +98,7 @@ def check_outputs(output_json: Path | None, figure: Path | None) -> None:
         raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
 
 
-# ---- Problem -------------------------------------------------------------------------------------
+# ---- problem: a known Markov decision process ----------------------------------------------------
 
 FIGURE_5 = {
     "start": "s0",
@@ -304,7 +306,7 @@ class Solution:
     history: list[dict[str, np.ndarray]]  # {"values": V_i, "action_values": Q_i, "policy": π_i} for i = 0, 1, …
 
 
-# ---- Algorithm -----------------------------------------------------------------------------------
+# ---- algorithm: exhaustive search ----------------------------------------------------------------
 
 
 def policy_graphs(mdp: MDP) -> Iterator[tuple[int, ...]]:
@@ -365,7 +367,7 @@ def mean_rewards(mdp: MDP, policy: np.ndarray, recurrent: np.ndarray) -> np.ndar
 
 
 @dataclass
-class Evaluation:
+class Candidate:
     """One pass of Algorithm 2: the policy graph, V (S,), V^π(s0), and the sweeps with the warm start and from V = 0."""
 
     rows: np.ndarray
@@ -377,8 +379,8 @@ class Evaluation:
 
 def exhaustive_search(
     mdp: MDP, discount: float, tolerance: float, max_iterations: int, max_policies: int
-) -> tuple[Solution, list[Evaluation]]:
-    """Algorithm 2 over the distinct policy graphs: π* with its values, and the first 1,000 evaluations.
+) -> tuple[Solution, list[Candidate]]:
+    """Algorithm 2 over the distinct policy graphs: π* with its values, and the first 1,000 candidates.
 
     Raises ValueError for more than max_policies policy graphs, an infinite V*(s0), and if no policy has a finite value.
     """
@@ -388,7 +390,7 @@ def exhaustive_search(
         number = f"{assignments(mdp)} assignments of actions, ∏|A_s|"
         raise ValueError(f"there are more than --max-policies {max_policies:,} policy graphs ({number})")
     settings = (discount, tolerance, max_iterations)
-    current_max, tied, evaluations = -math.inf, [], []
+    current_max, tied, candidates = -math.inf, [], []
     latest = np.zeros(len(mdp.states))  # (S,) V(s) under the latest policy that reached s
     for chosen in tqdm(policy_graphs(mdp), "policies", count, delay=2, leave=False):
         rows = np.sort(np.array(chosen, int))
@@ -402,9 +404,9 @@ def exhaustive_search(
             current_max, tied = value, []
         if abs(value - current_max) <= close:
             tied.append((rows, V))
-        if len(evaluations) < 1000:
+        if len(candidates) < 1000:
             cold_sweeps = evaluate_graph(mdp, rows, *settings, np.zeros(len(V)))[1]
-            evaluations.append(Evaluation(rows, V, value, sweeps, cold_sweeps))
+            candidates.append(Candidate(rows, V, value, sweeps, cold_sweeps))
     if not tied:
         raise ValueError("no policy has a finite value at discount 1: each can be caught where a reward is not 0")
     rows, V = tied[0]
@@ -412,9 +414,9 @@ def exhaustive_search(
     any_of = np.zeros(len(Q), bool)  # (rows,)
     any_of[np.concatenate([rows for rows, _ in tied])] = True
     residual = float(np.abs(Q[rows] - V[mdp.state_of_row[rows]]).max(initial=0))
-    history = [{"values": entry.V, "policy": first_rows(mdp, entry.rows)} for entry in evaluations]
-    values = [entry.value for entry in evaluations]
-    return Solution(V, Q, first_rows(mdp, rows), any_of, count, residual, values, history), evaluations
+    history = [{"values": entry.V, "policy": first_rows(mdp, entry.rows)} for entry in candidates]
+    values = [entry.value for entry in candidates]
+    return Solution(V, Q, first_rows(mdp, rows), any_of, count, residual, values, history), candidates
 
 
 def assignments(mdp: MDP) -> str:
@@ -466,7 +468,7 @@ def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
     return policy
 
 
-# ---- Algorithm: policies that never end ----------------------------------------------------------
+# ---- evaluation: which values are finite without a discount --------------------------------------
 
 
 def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
@@ -525,7 +527,7 @@ def names(mdp: MDP, states: np.ndarray) -> str:
     return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
 
 
-# ---- Report --------------------------------------------------------------------------------------
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 def readable(mdp: MDP) -> bool:
@@ -600,7 +602,7 @@ def as_json(mdp: MDP, solution: Solution) -> dict:
     }
 
 
-def write_json(path: Path | None, contents: object) -> None:
+def save_json(path: Path | None, contents: object) -> None:
     """Write --output-json, if it is asked for."""
     if path:
         path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
@@ -665,6 +667,7 @@ def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
 
 
 def main() -> None:
+    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
@@ -673,19 +676,19 @@ def main() -> None:
         check_outputs(args.output_json, args.figure)
         mdp = read_mdp(args.mdp, args.env_id, args.env_kwargs)
         settings = (args.discount, args.tolerance, args.max_iterations)
-        solution, evaluations = exhaustive_search(mdp, *settings, args.max_policies)
+        solution, candidates = exhaustive_search(mdp, *settings, args.max_policies)
         print(f"{solution.iterations:,} distinct policy graphs, of ∏|A_s| = {assignments(mdp)} assignments\n")
         table = []
-        for i, entry in enumerate(evaluations, start=1):
+        for i, entry in enumerate(candidates, start=1):
             policy = " ".join(f"{mdp.states[mdp.state_of_row[row]]}={mdp.actions[row]}" for row in entry.rows)
             value = f"{entry.value:.12g}" if np.isfinite(entry.value) else "not finite"
             policy = policy if len(policy) <= 60 else policy[:59] + "…"
             table.append([str(i), policy, value, str(entry.cold_sweeps), str(entry.sweeps)])
         print_table(["i", "policy", "V(start)", "sweeps from V = 0", "warm start"], table)
-        cold, warm = sum(entry.cold_sweeps for entry in evaluations), sum(entry.sweeps for entry in evaluations)
+        cold, warm = sum(entry.cold_sweeps for entry in candidates), sum(entry.sweeps for entry in candidates)
         print(f"The warm start saves {cold - warm} of {cold} sweeps.\n")
         print_solution(mdp, solution)
-        write_json(args.output_json, as_json(mdp, solution))
+        save_json(args.output_json, as_json(mdp, solution))
         save_figure(args.figure, mdp, {"Exhaustive search": solution}, "policy", "V of the start", "linear")
     except (ValueError, OSError) as error:
         fail(" ".join(str(error).split()))

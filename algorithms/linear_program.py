@@ -39,6 +39,8 @@ Flags = TypeVar("Flags")
 
 @dataclass
 class Args:
+    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in sweeps over all states."""
+
     mdp: Path | None = None
     """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
     env_id: str = ""
@@ -95,7 +97,7 @@ def check_outputs(output_json: Path | None, figure: Path | None) -> None:
         raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
 
 
-# ---- Problem -------------------------------------------------------------------------------------
+# ---- problem: a known Markov decision process ----------------------------------------------------
 
 FIGURE_5 = {
     "start": "s0",
@@ -303,7 +305,7 @@ class Solution:
     history: list[dict[str, np.ndarray]]  # {"values": V_i, "action_values": Q_i, "policy": π_i} for i = 0, 1, …
 
 
-# ---- Algorithm -----------------------------------------------------------------------------------
+# ---- algorithm: linear program, and value iteration beside it ------------------------------------
 
 
 def backup(mdp: MDP, V: np.ndarray, discount: float) -> np.ndarray:
@@ -423,7 +425,7 @@ def greedy_policy(mdp: MDP, Q: np.ndarray, tied: np.ndarray, discount: float) ->
     return policy
 
 
-# ---- Algorithm: without a discount ---------------------------------------------------------------
+# ---- evaluation: which values are finite without a discount --------------------------------------
 
 
 def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
@@ -497,7 +499,7 @@ def names(mdp: MDP, states: np.ndarray) -> str:
     return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
 
 
-# ---- Report --------------------------------------------------------------------------------------
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 def readable(mdp: MDP) -> bool:
@@ -572,7 +574,7 @@ def as_json(mdp: MDP, solution: Solution) -> dict:
     }
 
 
-def write_json(path: Path | None, contents: object) -> None:
+def save_json(path: Path | None, contents: object) -> None:
     """Write --output-json, if it is asked for."""
     if path:
         path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
@@ -650,6 +652,7 @@ def print_program(mdp: MDP, discount: float, solution: Solution, visits: np.ndar
 
 
 def main() -> None:
+    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
@@ -669,7 +672,7 @@ def main() -> None:
         times = f"linear program {1e3 * (solved - started):.3g} ms, value iteration {1e3 * (iterated - solved):.3g} ms"
         print(f"{times} ({len(changes)} sweeps); their V differ by at most {np.abs(solution.V - V).max():.3g}")
         visits_by_name = as_json(mdp, dataclasses.replace(solution, Q=visits))["action_values"]
-        write_json(args.output_json, {**as_json(mdp, solution), "visits": visits_by_name})
+        save_json(args.output_json, {**as_json(mdp, solution), "visits": visits_by_name})
         solution.changes, solution.history = changes, history
         save_figure(args.figure, mdp, {"Value iteration, for comparison": solution}, "sweep i", "max |V_i - V_i-1|")
     except (ValueError, OSError) as error:

@@ -40,6 +40,8 @@ Flags = TypeVar("Flags")
 
 @dataclass
 class Args:
+    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in sweeps over all states."""
+
     mdp: Path | None = None
     """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
     env_id: str = ""
@@ -101,7 +103,7 @@ def check_outputs(output_json: Path | None, figure: Path | None) -> None:
         raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
 
 
-# ---- Problem -------------------------------------------------------------------------------------
+# ---- problem: a known Markov decision process ----------------------------------------------------
 
 FIGURE_5 = {
     "start": "s0",
@@ -330,7 +332,7 @@ def parse_policy(mdp: MDP, text: str, rng: np.random.Generator) -> np.ndarray:
         pairs = [tuple(item.rpartition("=")[::2]) for item in text.split()]
     number = {str(state): s for s, state in enumerate(mdp.states)}
     bounds = np.append(mdp.first_row, len(mdp.R))  # (S + 1,)
-    policy = np.where(mdp.terminal, mdp.first_row, -1)  # (S,)
+    policy = np.full(len(mdp.first_row), -1)  # (S,)
     for state, action in pairs:
         if state not in number:
             raise ValueError(f"policy: {state!r} is no state" if state else f"policy: {action!r} is not state=action")
@@ -347,12 +349,12 @@ def parse_policy(mdp: MDP, text: str, rng: np.random.Generator) -> np.ndarray:
 def policy_graph(mdp: MDP, policy: np.ndarray) -> np.ndarray:
     """(S,) bool: the states that an agent following `policy` visits (§3.2). Raises ValueError if one has no action."""
     reached = search(state_graph(mdp, policy[policy >= 0]), mdp.start > 0) >= 0  # (S,)
-    if (without := reached & (policy < 0)).any():
+    if (without := reached & (policy < 0) & ~mdp.terminal).any():
         raise ValueError(f"the policy reaches {names(mdp, np.flatnonzero(without))} but names no action there")
     return reached
 
 
-# ---- Algorithm -----------------------------------------------------------------------------------
+# ---- algorithm: policy evaluation ----------------------------------------------------------------
 
 
 def backup(mdp: MDP, V: np.ndarray, discount: float) -> np.ndarray:
@@ -432,7 +434,7 @@ def simplest(x: float) -> Fraction:
     return fraction if float(fraction) == x else Fraction(repr(float(x)))
 
 
-# ---- Algorithm: policies that never end ----------------------------------------------------------
+# ---- evaluation: which values are finite without a discount --------------------------------------
 
 
 def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
@@ -491,7 +493,7 @@ def names(mdp: MDP, states: np.ndarray) -> str:
     return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
 
 
-# ---- Report --------------------------------------------------------------------------------------
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 def readable(mdp: MDP) -> bool:
@@ -566,7 +568,7 @@ def as_json(mdp: MDP, solution: Solution) -> dict:
     }
 
 
-def write_json(path: Path | None, contents: object) -> None:
+def save_json(path: Path | None, contents: object) -> None:
     """Write --output-json, if it is asked for."""
     if path:
         path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
@@ -662,7 +664,7 @@ def print_policy(
     print_table(["i", *(f"V_i({mdp.states[s]})" for s in states)], rows)
 
 
-def evaluate(
+def policy_evaluation(
     mdp: MDP, policy: np.ndarray, discount: float, tolerance: float, max_iterations: int, show: bool = False
 ) -> Solution:
     """V^π of a policy (S,) of rows, -1 where it has none, where it gets to, and NaN elsewhere; `show` prints the work.
@@ -699,6 +701,7 @@ def evaluate(
 
 
 def main() -> None:
+    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
@@ -712,11 +715,12 @@ def main() -> None:
         for name, text in policies.items():
             print(f"{name}: {text}\n")
             policy = parse_policy(mdp, text, np.random.default_rng(args.seed))
-            solutions[name] = evaluate(mdp, policy, args.discount, args.tolerance, args.max_iterations, show=True)
+            settings = (args.discount, args.tolerance, args.max_iterations)
+            solutions[name] = policy_evaluation(mdp, policy, *settings, show=True)
             print_solution(mdp, solutions[name])
             print()
         contents = [as_json(mdp, solution) for solution in solutions.values()]
-        write_json(args.output_json, contents if lecture else contents[0])
+        save_json(args.output_json, contents if lecture else contents[0])
         save_figure(args.figure, mdp, solutions, "sweep i", "max |V_i - V_i-1|")
     except (ValueError, OSError) as error:
         fail(" ".join(str(error).split()))

@@ -38,6 +38,8 @@ Flags = TypeVar("Flags")
 
 @dataclass
 class Args:
+    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in policies."""
+
     mdp: Path | None = None
     """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
     env_id: str = ""
@@ -99,7 +101,7 @@ def check_outputs(output_json: Path | None, figure: Path | None) -> None:
         raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
 
 
-# ---- Problem -------------------------------------------------------------------------------------
+# ---- problem: a known Markov decision process ----------------------------------------------------
 
 FIGURE_5 = {
     "start": "s0",
@@ -325,7 +327,7 @@ def parse_policy(mdp: MDP, text: str, rng: np.random.Generator) -> np.ndarray:
         pairs = [tuple(item.rpartition("=")[::2]) for item in text.split()]
     number = {str(state): s for s, state in enumerate(mdp.states)}
     bounds = np.append(mdp.first_row, len(mdp.R))  # (S + 1,)
-    policy = np.where(mdp.terminal, mdp.first_row, -1)  # (S,)
+    policy = np.full(len(mdp.first_row), -1)  # (S,)
     for state, action in pairs:
         if state not in number:
             raise ValueError(f"policy: {state!r} is no state" if state else f"policy: {action!r} is not state=action")
@@ -342,12 +344,12 @@ def parse_policy(mdp: MDP, text: str, rng: np.random.Generator) -> np.ndarray:
 def policy_graph(mdp: MDP, policy: np.ndarray) -> np.ndarray:
     """(S,) bool: the states that an agent following `policy` visits (§3.2). Raises ValueError if one has no action."""
     reached = search(state_graph(mdp, policy[policy >= 0]), mdp.start > 0) >= 0  # (S,)
-    if (without := reached & (policy < 0)).any():
+    if (without := reached & (policy < 0) & ~mdp.terminal).any():
         raise ValueError(f"the policy reaches {names(mdp, np.flatnonzero(without))} but names no action there")
     return reached
 
 
-# ---- Algorithm -----------------------------------------------------------------------------------
+# ---- algorithm: policy iteration -----------------------------------------------------------------
 
 
 def policy_iteration(
@@ -440,7 +442,7 @@ def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndar
     return np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
 
 
-# ---- Algorithm: without a discount ---------------------------------------------------------------
+# ---- evaluation: which values are finite without a discount --------------------------------------
 
 
 def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
@@ -532,7 +534,7 @@ def names(mdp: MDP, states: np.ndarray) -> str:
     return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
 
 
-# ---- Report --------------------------------------------------------------------------------------
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 def readable(mdp: MDP) -> bool:
@@ -607,7 +609,7 @@ def as_json(mdp: MDP, solution: Solution) -> dict:
     }
 
 
-def write_json(path: Path | None, contents: object) -> None:
+def save_json(path: Path | None, contents: object) -> None:
     """Write --output-json, if it is asked for."""
     if path:
         path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
@@ -671,7 +673,7 @@ def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
 # ---- main ----------------------------------------------------------------------------------------
 
 
-def print_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]) -> None:
+def print_policy_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]) -> None:
     """The lecture's three tables (§4.4): V^π(s), Q^π(s, a) and π(s) of each iteration."""
     acting = np.flatnonzero(~mdp.terminal[mdp.state_of_row])
     pairs = [f"Q({mdp.states[mdp.state_of_row[row]]}, {mdp.actions[row]})" for row in acting]
@@ -691,6 +693,7 @@ def print_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]
 
 
 def main() -> None:
+    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
@@ -707,9 +710,9 @@ def main() -> None:
             where = names(mdp, np.flatnonzero(lost))
             print(f"The initial policy has no finite value in {where}: there a policy that ends takes its place.\n")
         if readable(mdp):
-            print_tables(mdp, args.discount, solution.history)
+            print_policy_tables(mdp, args.discount, solution.history)
         print_solution(mdp, solution)
-        write_json(args.output_json, as_json(mdp, solution))
+        save_json(args.output_json, as_json(mdp, solution))
         save_figure(args.figure, mdp, {"Policy iteration": solution}, "iteration i", "max |V_i - V_i-1|")
     except (ValueError, OSError) as error:
         fail(" ".join(str(error).split()))

@@ -38,6 +38,8 @@ Flags = TypeVar("Flags")
 
 @dataclass
 class Args:
+    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in sweeps over all states."""
+
     mdp: Path | None = None
     """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
     env_id: str = ""
@@ -94,7 +96,7 @@ def check_outputs(output_json: Path | None, figure: Path | None) -> None:
         raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
 
 
-# ---- Problem -------------------------------------------------------------------------------------
+# ---- problem: a known Markov decision process ----------------------------------------------------
 
 FIGURE_5 = {
     "start": "s0",
@@ -302,7 +304,7 @@ class Solution:
     history: list[dict[str, np.ndarray]]  # {"values": V_i, "action_values": Q_i, "policy": π_i} for i = 0, 1, …
 
 
-# ---- Algorithm -----------------------------------------------------------------------------------
+# ---- algorithm: value iteration ------------------------------------------------------------------
 
 
 def backup(mdp: MDP, V: np.ndarray, discount: float) -> np.ndarray:
@@ -390,7 +392,7 @@ def greedy_policy(mdp: MDP, Q: np.ndarray, tied: np.ndarray, discount: float) ->
     return policy
 
 
-# ---- Algorithm: without a discount ---------------------------------------------------------------
+# ---- evaluation: which values are finite without a discount --------------------------------------
 
 
 def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
@@ -464,7 +466,7 @@ def names(mdp: MDP, states: np.ndarray) -> str:
     return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
 
 
-# ---- Report --------------------------------------------------------------------------------------
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 def readable(mdp: MDP) -> bool:
@@ -539,7 +541,7 @@ def as_json(mdp: MDP, solution: Solution) -> dict:
     }
 
 
-def write_json(path: Path | None, contents: object) -> None:
+def save_json(path: Path | None, contents: object) -> None:
     """Write --output-json, if it is asked for."""
     if path:
         path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
@@ -603,7 +605,7 @@ def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
 # ---- main ----------------------------------------------------------------------------------------
 
 
-def print_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]) -> None:
+def print_value_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]) -> None:
     """The lecture's two tables (§4.3): V_i(s), and Q_i(s, a) with the arithmetic."""
     V = [entry["values"] for entry in history]
     acting = np.flatnonzero(~mdp.terminal[mdp.state_of_row])
@@ -619,6 +621,7 @@ def print_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]
 
 
 def main() -> None:
+    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
@@ -633,12 +636,12 @@ def main() -> None:
         policy = greedy_policy(mdp, Q, tied, args.discount)
         solution = Solution(V, Q, policy, tied, len(changes), changes[-1], changes, history)
         if readable(mdp):
-            print_tables(mdp, args.discount, history)
+            print_value_tables(mdp, args.discount, history)
         print_solution(mdp, solution)
         if args.discount < 1:
             # ‖V - V*‖ ≤ γ / (1 - γ) ‖V_i - V_i-1‖, for a backup is a contraction by γ
             print(f"max |V - V*| <= {args.discount / (1 - args.discount) * solution.residual:.3g}")
-        write_json(args.output_json, as_json(mdp, solution))
+        save_json(args.output_json, as_json(mdp, solution))
         save_figure(args.figure, mdp, {"Value iteration": solution}, "sweep i", "max |V_i - V_i-1|")
     except (ValueError, OSError) as error:
         fail(" ".join(str(error).split()))
