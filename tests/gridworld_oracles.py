@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 
+import gymnasium as gym
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -51,6 +52,25 @@ def policy_map(Q):
     """The greedy policy as rows of arrows, top to bottom, `*` for a terminal and `#` for the wall: ">>>*/^#<*/^<<<"."""
     arrows = {cell: "*" if cell in PAID else "<^>v"[Q[s].argmax()] for s, cell in enumerate(CELLS)}
     return "/".join("".join(arrows.get((x, y), "#") for x in range(1, 5)) for y in (3, 2, 1))
+
+
+class Transcript(gym.Wrapper):
+    """Keeps every transition (s, a, r, s', terminated) and how each episode began."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.transitions, self.seeds = [], []
+
+    def reset(self, *, seed=None, options=None):
+        self.seeds.append(seed)
+        self.s, info = self.env.reset(seed=seed, options=options)
+        return self.s, info
+
+    def step(self, action):
+        s_next, r, terminated, truncated, info = self.env.step(action)
+        self.transitions.append((self.s, action, r, s_next, terminated))
+        self.s = s_next
+        return s_next, r, terminated, truncated, info
 
 
 def run_main(script, monkeypatch, capsys, *flags):

@@ -15,6 +15,7 @@ from gridworld_oracles import (
     FIGURE_10,
     OPTIMAL,
     PAID,
+    Transcript,
     assert_refused,
     optimal_table,
     policy_map,
@@ -36,25 +37,6 @@ def learn(env, **settings):
 def q_star(world, discount=1.0):
     """Q* (S, A) by the script."""
     return script.optimal_action_values(*script.model_matrices(world.P, 11, 4), discount)
-
-
-class Transcript(gym.Wrapper):
-    """Keeps every transition (s, a, r, s', terminated) and how each episode began."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.transitions, self.seeds = [], []
-
-    def reset(self, *, seed=None, options=None):
-        self.seeds.append(seed)
-        self.s, info = self.env.reset(seed=seed, options=options)
-        return self.s, info
-
-    def step(self, action):
-        s_next, r, terminated, truncated, info = self.env.step(action)
-        self.transitions.append((self.s, action, r, s_next, terminated))
-        self.s = s_next
-        return s_next, r, terminated, truncated, info
 
 
 class Corridor(gym.Env):
@@ -249,7 +231,7 @@ class TestAlgorithm:
         """Without exploration and with nothing learnt yet, each action is tried, and the robot leaves (1,1)."""
         first = []
         for seed in range(200):
-            args = Args(episodes=1, seed=seed, epsilon_initial=0.0, epsilon_final=0.0, step_reward=0.0, slip_probability=0.0)
+            args = Args(episodes=1, seed=seed, epsilon_initial=0.0, epsilon_final=0.0, step_reward=0.0)
             env = Transcript(script.make_environment(args))
             last = learn(env, **vars(args))
             first.append(env.transitions[0][1])
@@ -348,8 +330,8 @@ class TestCommandLine:
         assert "Q after 1,000 episodes" in done.stdout and "Q* by value iteration" in done.stdout
         for name, values in result["action_values"].items():  # four per cell, each on its own side
             x, y = eval(name)
-            rows = [line.split("|")[1:5] for line in done.stdout.splitlines() if line.count("|") == 5][3 * (3 - y) :][:3]
-            top, middle, bottom = (row[x - 1].split() for row in rows)
+            rows = [line.split("|")[1:5] for line in done.stdout.splitlines() if line.count("|") == 5]
+            top, middle, bottom = (row[x - 1].split() for row in rows[3 * (3 - y) :][:3])
             shown = dict(left=middle[0], up=top[0], right=middle[1], down=bottom[0])
             assert {action: f"{values[action]:.3f}" for action in ACTIONS} == shown
             assert result["policy"][name] == max(values, key=values.get)
