@@ -2,9 +2,28 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy>=2.0", "scipy>=1.14", "gymnasium>=1.0", "tyro>=0.9", "tqdm>=4.66", "matplotlib>=3.9"]
 # ///
-"""Exhaustive search: the best of all policies of a known Markov decision process (§4.2 and Algorithm 2 of the lecture).
+"""Exhaustive search: the best of all policies of a known Markov decision process (§4.2 and Algorithm 2).
 
-DOC
+Run it
+    python algorithms/exhaustive_search.py                                    # the lecture's MDP
+    python algorithms/exhaustive_search.py --mdp my_mdp.json --discount 0.9 --output-json best.json
+
+Measured
+    The first command goes through 3 policy graphs, of 4 assignments of actions; V(s0) = 11, 9 and 10.09, so that π¹
+    is the best. The warm start saves 1 of 36 sweeps. `--env-id FrozenLake-v1` is refused: 4,294,967,296
+    assignments.
+
+Deviations
+    lecture                      this file                               why
+    ---------------------------  --------------------------------------  ----------------------------------------------
+    enumerate all policies       distinct policy graphs                  what is not reached needs no action; there are
+                                                                         3 in the lecture's example, too
+    initialise V_0 from common   V(s) under the latest policy that       neighbours in the enumeration share most of
+    subgraphs (§4.2)             reached s, 0 if none did                their graph
+    line 6: <                    < by more than 1e-9; ties are reported  floats
+    no discount                  `--discount` γ, 1 if not given          to serve other MDPs
+    nothing of endless policies  passed over if their value is not       the limit of Algorithm 1 from V_0 = 0
+                                 finite; an error if V* is infinite
 """
 
 import collections
@@ -344,10 +363,10 @@ def evaluate_graph(
                 where = names(mdp, np.flatnonzero(paid))
                 raise ValueError(f"V* is infinite at discount 1: rewards above 0 can be collected for ever in {where}")
             return V + np.nan, 0
+        # Easy to get wrong: V(s) = V(s) would keep its first value, of an earlier policy. It must be 0.
         live &= ~caught
     P, R = policy_system(mdp, policy, live)
-    # Easy to get wrong: a state that is never left keeps the value that it starts with; that must be 0, and not V_0.
-    V_end, changes, _ = iterative_policy_evaluation(P, R, discount, np.where(live, V_0, 0.0), tolerance, max_iterations)
+    V_end, changes, _ = iterative_policy_evaluation(P, R, discount, V_0, tolerance, max_iterations)
     return V + V_end, len(changes)
 
 

@@ -2,9 +2,29 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy>=2.0", "scipy>=1.14", "gymnasium>=1.0", "tyro>=0.9", "tqdm>=4.66", "matplotlib>=3.9"]
 # ///
-"""Linear programming: the best policy of a known Markov decision process (§4.3, Equation 27 of the lecture).
+"""Linear programming: the best policy of a known Markov decision process (§4.3, Equation 27).
 
-DOC
+Run it
+    python algorithms/linear_program.py                                       # the lecture's MDP, the program in full
+    python algorithms/linear_program.py --env-id FrozenLake-v1 --discount 0.99
+    python algorithms/linear_program.py --mdp my_mdp.json --output-json best.json
+
+§4.3 says that Equation 27 may be solved by a linear program, and stops there. This file does it, with value iteration
+beside it.
+
+Measured
+    The first command prints V* = (11, 1, 4, 0) and the visits 1.3, 2.3 and 1 of the best actions.
+
+Deviations
+    lecture                        this file                                why
+    -----------------------------  ---------------------------------------  --------------------------------------------
+    solve Equation 27 by a linear  minimise Σ V(s) over V ≥ R + γ P V       the least V that keeps the constraints is V*
+    program solver                 with HiGHS, by SciPy
+    π* = argmax                    from the constraints that are tight, at  to walk to and fro for nothing is a tie
+                                   discount 1 such that it also ends
+    no discount                    `--discount` γ, 1 if not given           to serve other MDPs
+    nothing of endless policies    V ≥ 0 where rewards of 0 can go on for   V would have no lower bound there
+                                   ever; an error if V* is infinite
 """
 
 import collections

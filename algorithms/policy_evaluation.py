@@ -4,7 +4,25 @@
 # ///
 """Policy evaluation: the value of a policy in a known Markov decision process (§3, Algorithm 1, Equations 2 and 3).
 
-DOC
+Run it
+    python algorithms/policy_evaluation.py                                    # the lecture's π¹, π² and π³
+    python algorithms/policy_evaluation.py --policy "s0=a2 s1=a1 s2=a2"
+    python algorithms/policy_evaluation.py --env-id FrozenLake-v1 --policy best.json --figure lake.png
+    python algorithms/policy_evaluation.py --mdp my_mdp.json --policy random --discount 0.95 --output-json values.json
+
+Measured
+    The first command prints V(s0) = 111/11 and V(s2) = 41/11 for π³ from the linear system; Algorithm 1 needs 30
+    sweeps to come within 1.6e-13 of it.
+
+Deviations
+    lecture                      this file                                why
+    ---------------------------  ---------------------------------------  ------------------------------------------
+    no discount                  `--discount` γ, 1 if not given           to serve other MDPs
+    all V_0 may be initialised   V_0 = 0                                  so do the lecture's tables
+    "until V has converged"      no V changes by more than `--tolerance`  floats
+    solve the linear system      BiCGSTAB above 1,000 states              a sparse factorisation fills in
+    nothing of endless policies  value 0 where all rewards are 0, else    the limit of Algorithm 1 from V_0 = 0; the
+                                 an error that names the states           linear system is singular there
 """
 
 import collections

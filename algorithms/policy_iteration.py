@@ -2,9 +2,30 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy>=2.0", "scipy>=1.14", "gymnasium>=1.0", "tyro>=0.9", "tqdm>=4.66", "matplotlib>=3.9"]
 # ///
-"""Policy iteration: the best policy of a known Markov decision process (§4.4, Algorithm 4 of the lecture).
+"""Policy iteration: the best policy of a known Markov decision process (§4.4 and Algorithm 4).
 
-DOC
+Run it
+    python algorithms/policy_iteration.py                           # the lecture's MDP from π², its three tables
+    python algorithms/policy_iteration.py --initial-policy random --seed 7
+    python algorithms/policy_iteration.py --env-id Taxi-v3 --figure taxi.png
+    python algorithms/policy_iteration.py --mdp my_mdp.json --initial-policy "s0=a1 s1=a2" --discount 0.95
+
+Measured
+    The first command ends at i = 2 with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1: V(0) =
+    0.823529411765 (14/17) after 8 iterations. Taxi-v3 at discount 1 begins with a policy that never ends and
+    finishes with a mean V of 7.93.
+
+Deviations
+    lecture                      this file                                why
+    ---------------------------  ---------------------------------------  ----------------------------------------------
+    begin with a random policy   with π² (its own example), the first     to see the lecture's tables
+                                 actions, or `--initial-policy`
+    π(s) = argmax Q(s, a)        an action changes for a gain above       tied policies would go round for ever
+                                 `--tolerance` only
+    perform policy evaluation    the linear system of Equations 2 and 3   exact; Algorithm 1 is in policy_evaluation.py
+    nothing of endless policies  where the first one has no finite value  no singular system, and every later policy has
+                                 it is replaced by one that ends          finite values
+    no discount                  `--discount` γ, 1 if not given           to serve other MDPs
 """
 
 import collections

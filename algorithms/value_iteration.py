@@ -4,7 +4,26 @@
 # ///
 """Value iteration: the best policy of a known Markov decision process (§4.3, Algorithm 3, Equations 27-31).
 
-DOC
+Run it
+    python algorithms/value_iteration.py                                      # the lecture's MDP, its two tables
+    python algorithms/value_iteration.py --env-id FrozenLake-v1 --env-kwargs "map_name=8x8" --figure lake.png
+    python algorithms/value_iteration.py --env-id Taxi-v3 --discount 0.99
+    python algorithms/value_iteration.py --mdp my_mdp.json --output-json best.json
+
+Measured
+    The first command ends after 5 sweeps with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1:
+    V(0) = 0.823529411742 (exactly 14/17) after 994 sweeps.
+
+Deviations
+    lecture                     this file                                why
+    --------------------------  ---------------------------------------  -----------------------------------------------
+    no discount                 `--discount` γ, 1 if not given; below 1  a backup is then a contraction
+                                a bound of the error is printed
+    "until V has converged"     until no V changes by more than          floats; Q is a step behind V, and the lecture's
+                                `--tolerance`, and then one sweep more   tables, too, go on to i = 5
+    i stays 0 (Algorithm 3)     i = i + 1 in every sweep                 as in Algorithm 1
+    π* = argmax Q*              at discount 1 such that it also ends     to walk to and fro for nothing is a tie
+    nothing of infinite values  an error that names the states           rewards collected for ever have no finite sum
 """
 
 import collections

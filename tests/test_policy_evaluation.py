@@ -76,7 +76,8 @@ def test_a_policy_of_ones_own_as_printed_and_as_json(policy, monkeypatch, capsys
     defined = {state: value for state, value in result["values"].items() if value is not None}
     assert defined == pytest.approx({state: float(value) for state, value in solution.items()}, abs=1e-12)
     if policy.endswith("s2=a2"):
-        assert [entry["values"]["s0"] for entry in result["history"][:4]] == pytest.approx([0, 8, 8.88, 9.84], abs=1e-12)
+        steps = [entry["values"]["s0"] for entry in result["history"][:4]]
+        assert steps == pytest.approx([0, 8, 8.88, 9.84], abs=1e-12)
         assert result["history"][3]["values"]["s2"] == pytest.approx(3.364, abs=1e-12)  # printed 3.36
     assert result["policy"] == dict(item.split("=") for item in policy.split())
 
@@ -159,7 +160,7 @@ def test_a_policy_that_never_ends(monkeypatch, capsys, tmp_path):
     ("nowhere.json", "nowhere.json"),
 ])  # fmt: skip
 def test_bad_policies(text, message, monkeypatch, capsys):
-    code, out, err = run(script, monkeypatch, capsys, "--policy", text)
+    code, _, err = run(script, monkeypatch, capsys, "--policy", text)
     assert code == 2 and message in err and err.count("\n") == 1
 
 

@@ -74,13 +74,13 @@ def test_only_the_states_that_cannot_end_are_given_another_action():
         "terminal": ["goal"],
         "transitions": {
             "a": {"stay": [[1, "a", -1]], "out": [[1, "goal", -1]]},
-            "b": {"out": [[1, "goal", -5]], "on": [[1, "a", 0]]},
+            "b": {"out": [[1, "goal", -5]], "dear": [[1, "goal", -6]], "on": [[1, "a", 0]]},
         },
     }
     mdp = script.mdp_from_json(model)
-    solution, lost = script.policy_iteration(mdp, mdp.first_row, 1.0, 1e-9, 100)
+    solution, lost = script.policy_iteration(mdp, np.array([0, 3, 5]), 1.0, 1e-9, 100)
     assert lost.tolist() == [True, False, False]
-    assert solution.history[0]["policy"][:2].tolist() == [1, 2] and solution.V.tolist() == [-1, -1, 0]
+    assert solution.history[0]["policy"].tolist() == [1, 3, 5] and solution.V.tolist() == [-1, -1, 0]
 
 
 def test_an_infinite_value_is_proved_on_the_way():

@@ -1,6 +1,7 @@
 """Value iteration: the lecture's two tables (§4.3), the error bound, discount 1, Gymnasium, models of arrays."""
 
 import json
+import re
 
 import numpy as np
 import policy_evaluation
@@ -66,7 +67,7 @@ def test_the_lectures_two_tables_as_json(monkeypatch, capsys, tmp_path):
     assert set(result) == {"values", "action_values", "policy", "ties", "iterations", "residual", "history"}
 
 
-def test_the_bound_holds_and_is_printed(monkeypatch, capsys, tmp_path):
+def test_the_bound_holds_and_is_printed(monkeypatch, capsys):
     for seed in range(60):
         rng = np.random.default_rng(seed)
         model, discount = random_model(rng, proper=False), float(rng.choice([0, 0.3, 0.9]))
@@ -74,8 +75,11 @@ def test_the_bound_holds_and_is_printed(monkeypatch, capsys, tmp_path):
         bound = discount / (1 - discount) * changes[-1]
         error = max(abs(v - V[s]) for s, v in enumerate(best_values(model, discount).values()))
         assert error <= bound + 1e-12
-    _, out, _ = run(script, monkeypatch, capsys, "--discount", 0.9, "--tolerance", 0.5)
+    _, out, _ = run(script, monkeypatch, capsys, "--discount", 0.9)
     assert "max |V - V*| <= 0" in out and "0.6·[10 + 0.9·1] + 0.4·[5 + 0.9·1] = 8.9" in out
+    _, out, _ = run(script, monkeypatch, capsys, "--env-id", "FrozenLake-v1", "--discount", 0.98, "--tolerance", 1e-4)
+    residual, bound = re.search(r"Bellman residual (\S+)\nmax \|V - V\*\| <= (\S+)\n", out).groups()
+    assert float(bound) == pytest.approx(49 * float(residual), rel=0.02) and float(bound) > 1e-4
 
 
 def test_discount_0_counts_the_next_reward_alone():
@@ -112,6 +116,7 @@ class TestWithoutDiscount:
             code, _, err = run(module, monkeypatch, capsys, *flags)
             assert code == 2 and err.count("\n") == 1 and err.startswith("error: ")
             assert " s" in err or module.__name__ == "linear_program", err
+            assert "V* is infinite at discount 1" in err or (model, module) == (ENDLESS_GAIN, script)
 
     def test_a_state_without_a_finite_value_is_named(self, module, monkeypatch, capsys, tmp_path):
         model = {**TRAP, "start": "t"}
