@@ -1,0 +1,1607 @@
+# /// script
+# requires-python = ">=3.10"
+# dependencies = [
+#     "ale-py>=0.11", "filelock", "gymnasium>=1.0", "lz4", "matplotlib>=3.9", "numpy>=1.26",
+#     "opencv-python-headless", "psutil", "tensorboard", "torch>=2.6", "tqdm", "tyro>=0.9",
+# ]
+# ///
+"""Deep Q-Learning on Atari games, taken apart: Tables 4, 5 and 6 of the lecture (ECE 544NA, Lecture 27, §7.5), the
+method of Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015). This is
+dqn_atari.py and the experiment; `diff dqn_atari.py dqn_atari_ablation.py` shows the experiment and nothing else.
+
+    --initialization default|he|orthogonal   weights of the convolutions (Table 4); all else stays PyTorch's default
+    --no-target-network                      bootstrap from the online network: θ⁻ = θ after every update; still no
+                                             gradient passes through the bootstrap (Table 6)
+    --no-replay-buffer                       the minibatch is the optimizer_minibatch_size most recent transitions, in
+                                             order (Table 6). The lecture does not say how it did this. Everything else
+                                             is unchanged: the random frames before learning starts, the update
+                                             frequency, the minibatch's size
+With none of the three a run is bit for bit that of dqn_atari.py.
+
+Run it
+    python algorithms/dqn_atari_ablation.py --no-target-network                     # one arm; Breakout, Table 3
+    python algorithms/dqn_atari_ablation.py --study ablation --seeds 3              # Table 6, one run after another
+    python algorithms/dqn_atari_ablation.py --study games --seeds 3 --list          # Table 5's commands, for a cluster
+    python algorithms/dqn_atari_ablation.py --table runs --figure curves.png        # what has been measured so far
+The same --study command goes on where it was cut off. Each command of --list does that too, for its own run.
+
+Measured
+    RESULT
+
+Deviations
+    lecture or paper                        this file                              why
+    --------------------------------------  -------------------------------------  ------------------------------------
+    Algorithm 6 copies θ to θ⁻ at every     every 1,000 frames                     Table 3 says so; the two disagree
+    evaluation
+    squared error (Algorithm 6, line 22)    Huber loss                             §5.3: [8] clips the error's gradient;
+                                                                                   so does this file
+    [8] acts at random until learning       ε is annealed from the first frame     Algorithm 6, lines 10-13
+    starts
+    [8]: biases and weights uniform         orthogonal convolution filters,        §7.5.1: the best of Table 4
+                                            PyTorch's default elsewhere
+    [8]: a state begins with empty frames   a state begins with copies of the      one rule for acting and replay; no
+                                            episode's first frame                  frame that was never on the screen
+    [8]: 1 to 30 no-ops                     0 to 30 no-ops, in emulator frames     §7.2.1: "maximum number"
+    32-bit arithmetic                       bfloat16 inside an update, on CPUs     twice as fast; master weights, the
+                                            that have it (--precision)             head, Adam and acting stay 32-bit
+    raw frames, shared by reference         LZ4-compressed frames, by reference    0.3 to 1.4 GB instead of 11 GB
+    [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
+    no replay: not described                minibatch = the last transitions       Table 6 needs a rule; this one
+                                                                                   changes the memory, nothing else
+    mean max Q: not reported                of 500 held-out states, at every       it shows what diverges without a
+                                            evaluation                             target network
+    one run per arm                         --seeds; from three up, interquartile  one run of each is an anecdote
+                                            mean and 95% bootstrap interval
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import csv
+import dataclasses
+import difflib
+import functools
+import io
+import itertools
+import json
+import math
+import operator
+import os
+import platform
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import zipfile
+from collections import OrderedDict, deque
+from pathlib import Path
+from typing import Literal, NamedTuple, NoReturn, TypeVar
+
+import ale_py
+import cv2
+import filelock
+import gymnasium as gym
+import lz4.block
+import numpy as np
+import psutil
+import torch
+import torch.nn.functional as F
+import tyro
+from matplotlib.figure import Figure
+from torch import nn
+from torch.func import functional_call
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+Flags = TypeVar("Flags")
+
+LOG_INTERVAL = 500  # frames between two points of a curve
+CHECKPOINT_FORMAT = "dqn_atari checkpoint 1"
+Q_NETWORK_FORMAT = "dqn_atari q_network 1"
+HELD_OUT_STATES = 500
+HELD_OUT_INTERVAL = 10  # frames of random play from one held-out state to the next
+
+
+
+# ---- Args ------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Args:
+    """One unit of time: a FRAME is a frame that the agent observes = one action of the agent = `agent_action_repeat`
+    (4) emulator frames. An EPISODE is one life while training; a GAME ends with the last life. The flags down to
+    `optimizer_learning_rate` are Table 3, in its order and with its values."""
+
+    environment_train_frames_max: int = 10_000_000
+    """Frames to train for [Table 3; 50,000,000 in the paper]."""
+    environment_evaluation_episodes: int = 10
+    """Games that one evaluation plays [Table 3]."""
+    environment_evaluation_interval_episodes: int = 500
+    """Episodes between evaluations [Table 3]."""
+    environment_checkpoint_interval_episodes: int = 500
+    """Episodes between checkpoints [Table 3]."""
+    environment_no_op_max: int = 30
+    """At most this many no-operations, in emulator frames, before the agent may act in a new game [Table 3]."""
+    environment_reward_clip_limit: float = 1.0
+    """While training, the reward of a frame is clipped to [-limit, limit] [Table 3]."""
+    environment_frames_to_maxpool: int = 2
+    """Most recent emulator frames whose pixelwise maximum is the screen [Table 3]."""
+    environment_state_height: int = 84
+    """Height of a frame given to the network, pixels [Table 3]."""
+    environment_state_width: int = 84
+    """Width of a frame given to the network, pixels [Table 3]."""
+    agent_history_length: int = 4
+    """Most recent frames in a state [Table 3]."""
+    agent_action_repeat: int = 4
+    """Emulator frames for which an action is repeated [Table 3]."""
+    agent_update_frequency: int = 1
+    """Actions (frames) from one optimization iteration to the next [Table 3; 4 in the paper]."""
+    agent_discount_factor: float = 0.99
+    """γ, discount factor of a frame [Table 3, Equation 37]."""
+    agent_epsilon_greedy_epsilon_initial: float = 1.0
+    """ε_initial, probability of a random action at frame 0 [Table 3]."""
+    agent_epsilon_greedy_epsilon_final: float = 0.01
+    """ε_final, the same once annealed [Table 3; 0.1 in the paper]."""
+    agent_epsilon_greedy_annealing: int = 1_000_000
+    """Frames over which ε goes linearly from ε_initial to ε_final [Table 3]."""
+    agent_epsilon_greedy_epsilon_evaluation: float = 0.05
+    """ε while evaluating [Table 3]."""
+    agent_replay_buffer_initial: int = 100_000
+    """Transitions in the replay memory before learning starts [Table 3; 50,000 in the paper]."""
+    agent_replay_buffer_maximum_length: int = 1_000_000
+    """N, transitions that the replay memory 𝒟 holds; the oldest give way [Table 3]."""
+    optimizer_name: Literal["Adam", "RMSprop"] = "Adam"
+    """Adam [Table 3], or the released RMSProp of the paper: centred, its constant inside the root, no momentum."""
+    optimizer_minibatch_size: int = 32
+    """Transitions in a minibatch ℬ [Table 3]."""
+    optimizer_q_network_parameter_update_interval_frames: int = 1_000
+    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 in the paper]."""
+    optimizer_learning_rate: float = 0.0001
+    """Learning rate [Table 3; 0.00025 in the paper]."""
+
+    initialization: Literal["default", "he", "orthogonal"] = "orthogonal"
+    """Weights of the convolutions: PyTorch's default, He-normal or orthogonal [Table 4]."""
+    target_network: bool = True
+    """Bootstrap from θ⁻, copied every C frames; without it θ⁻ = θ after every update [Table 6]."""
+    replay_buffer: bool = True
+    """Draw ℬ uniformly from 𝒟; without it ℬ is the most recent transitions, in order [Table 6]."""
+    study: Literal["", "initialization", "ablation", "games"] = ""
+    """Run all the arms of Table 4, Table 6 or Table 5, one after another; what is finished is skipped."""
+    seeds: int = 1
+    """Runs of each of a study's arms, with the seeds from --seed up."""
+    list: bool = False
+    """Print a study's commands, one run a line, instead of running them."""
+    table: str = ""
+    """A folder: print Tables 4, 5 and 6 as far as the test.json files below it go, beside the lecture's figures."""
+    markdown: bool = False
+    """Print the tables as Markdown instead of text."""
+    figure: str = ""
+    """A file to draw the learning curves of --table's folder in: .png, .pdf or .svg."""
+
+    env_id: str = "BreakoutNoFrameskip-v4"
+    """The game: any of Gymnasium's Atari names, PongNoFrameskip-v4 or ALE/Pong-v5; both mean the same here."""
+    seed: int = 1
+    """Seed of the weights, the exploration, the minibatches, the no-operations and the evaluations."""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Where the network lives; auto takes an accelerator if PyTorch sees one."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Arithmetic inside an update; auto takes bfloat16 on a CPU that multiplies it, float32 elsewhere."""
+    environment_test_frames: int = 135_000
+    """Frames of the final test, in which only finished games count [§7.3.3]."""
+    optimizer_gradient_momentum: float = 0.95
+    """RMSprop only: decay of the mean gradient that centres it [Figure 18]."""
+    optimizer_squared_gradient_momentum: float = 0.95
+    """RMSprop only: decay of the mean squared gradient [Figure 18]."""
+    optimizer_min_squared_gradient: float = 0.01
+    """RMSprop only: constant added inside the root [Figure 18]."""
+    replay_encoding: Literal["auto", "lz4", "raw", "tensor"] = "auto"
+    """How a frame is kept: LZ4 bytes, a raw array, or a tensor on the device; auto takes tensor where an accelerator
+    has room for it, else lz4."""
+    checkpoint_interval_minutes: float = 10.0
+    """Minutes after which a checkpoint is written even if no interval of episodes has passed."""
+    resume: str = ""
+    """A run directory to go on with; its own flags hold, only --environment-train-frames-max may be raised. auto: the
+    newest run with these very flags in --runs-dir, or a new one if there is none."""
+    runs_dir: str = "runs"
+    """Folder that the run directory is made in."""
+
+
+def fail(message: str) -> NoReturn:
+    """Bad input: one line on standard error, exit code 2."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def parse_args(args_class: type[Flags]) -> Flags:
+    """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(args_class, description=__doc__)
+    except SystemExit as stop:
+        if stop.code != 2:
+            raise
+        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
+        fail(" ".join(itertools.takewhile(lambda line: not line.startswith(("─", "╰")), lines)) + " (see --help)")
+
+
+def flag(name: str) -> str:
+    """The command-line spelling of a field of Args."""
+    return "--" + name.replace("_", "-")
+
+
+def check_args(args: Args) -> None:
+    """Raise ValueError, with the flag's name, for a value that no run can use."""
+    numbers = {name: value for name, value in vars(args).items() if not isinstance(value, str)}
+    for name, value in numbers.items():
+        if "epsilon_greedy_epsilon" in name or "momentum" in name or name == "agent_discount_factor":
+            good, demand = 0 <= value <= 1, "lie between 0 and 1"
+        elif name in ("environment_state_height", "environment_state_width"):
+            good, demand = value >= 36, "be at least 36, which three strided convolutions need"
+        elif name in ("seed", "environment_no_op_max"):
+            good, demand = value >= 0, "be at least 0"
+        else:
+            good, demand = 0 < value < math.inf, "be above 0"
+        if not good:
+            raise ValueError(f"{flag(name)} must {demand}, not {value}")
+    for small, large in (("optimizer_minibatch_size", "agent_replay_buffer_initial"),
+                         ("agent_replay_buffer_initial", "agent_replay_buffer_maximum_length")):
+        if numbers[small] > numbers[large]:
+            raise ValueError(f"{flag(small)} {numbers[small]} must not be above {flag(large)} {numbers[large]}")
+    for name, available in (("cuda", torch.cuda.is_available()), ("mps", torch.backends.mps.is_available())):
+        if args.device == name and not available:
+            raise ValueError(f"--device {name}: this PyTorch sees no such device; use --device auto or --device cpu")
+
+
+def check_ablation_args(args: Args) -> None:
+    """check_args, and this script's own. Raises ValueError."""
+    switches = {name: True for name, value in vars(args).items() if isinstance(value, bool)}
+    check_args(dataclasses.replace(args, **switches))  # a switch is no number that could be too small
+    for name, needed in (("seeds", "study"), ("list", "study"), ("markdown", "table"), ("figure", "table")):
+        if getattr(args, name) != getattr(Args, name) and not getattr(args, needed):
+            raise ValueError(f"{flag(name)} needs {flag(needed)}")
+    if args.table and args.study:
+        raise ValueError("--table and --study are two commands")
+    if args.figure and Path(args.figure).suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"--figure {args.figure}: the name must end in .png, .pdf or .svg")
+    if args.study and args.resume:
+        raise ValueError("--study resumes by itself what was cut off; leave out --resume")
+    for name in STUDIES[args.study][0] if args.study else ():
+        if getattr(args, name) != getattr(Args, name):
+            raise ValueError(f"--study {args.study} sets {flag(name)} itself, arm by arm")
+
+
+# ---- problem: the Atari environment and its wrappers -----------------------------------------------
+#
+#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12      60 a second
+#   action           a₁ ────────  a₂ ────────  a₃ ───────    repeated 4 times, rewards summed
+#   max-pool               3∨4         7∨8       11∨12       of the last two: some sprites are drawn every other frame
+#   frame                   x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
+#   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
+
+
+class JoystickActions(gym.ActionWrapper):
+    """The game's minimal actions without diagonals and without FIRE off centre (§7.3.3): a subset of NOOP, FIRE, UP,
+    RIGHT, LEFT, DOWN. `meanings` names them."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        minimal = env.unwrapped.get_action_meanings()
+        self.meanings = [name for name in minimal if name in ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")]
+        self.indices = [minimal.index(name) for name in self.meanings]
+        self.action_space = gym.spaces.Discrete(len(self.meanings))
+
+    def action(self, action: int) -> int:
+        return self.indices[action]
+
+
+class NoOpReset(gym.Wrapper):
+    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
+        super().__init__(env)
+        self.no_op_max, self.rng = no_op_max, rng
+
+    def reset(self, **kwargs):
+        screen, info = self.env.reset(**kwargs)
+        for _ in range(self.rng.integers(self.no_op_max + 1)):
+            screen, _, terminated, truncated, info = self.env.step(0)
+            if terminated or truncated:
+                screen, info = self.env.reset()
+        return screen, info
+
+
+class MaxPool(gym.Wrapper):
+    """The screen is the pixelwise maximum, per colour, of the last `length` emulator frames (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, length: int):
+        super().__init__(env)
+        self.screens = deque(maxlen=length)  # each (210, 160, 3) uint8
+
+    def reset(self, **kwargs):
+        screen, info = self.env.reset(**kwargs)
+        self.screens.clear()
+        self.screens.append(screen)
+        return screen, info
+
+    def step(self, action: int):
+        screen, reward, terminated, truncated, info = self.env.step(action)
+        self.screens.append(screen)
+        return functools.reduce(np.maximum, self.screens), reward, terminated, truncated, info  # (210, 160, 3) uint8
+
+
+class ActionRepeat(gym.Wrapper):
+    """An action lasts `repeat` emulator frames, or until the game ends; its rewards are summed (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, repeat: int):
+        super().__init__(env)
+        self.repeat = repeat
+
+    def step(self, action: int):
+        total_reward = 0.0
+        for _ in range(self.repeat):
+            screen, reward, terminated, truncated, info = self.env.step(action)
+            total_reward += reward
+            if terminated or truncated:
+                break
+        return screen, total_reward, terminated, truncated, info
+
+
+class Greyscale(gym.ObservationWrapper):
+    """Colour to luminance, 0.299 R + 0.587 G + 0.114 B (§7.2.1)."""
+
+    def observation(self, screen: np.ndarray) -> np.ndarray:
+        return cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY)  # (210, 160) uint8
+
+
+class Downsample(gym.ObservationWrapper):
+    """Bilinear downsampling to `height` × `width` (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, height: int, width: int):
+        super().__init__(env)
+        self.height, self.width = height, width
+        self.observation_space = gym.spaces.Box(0, 255, (height, width), np.uint8)
+
+    def observation(self, screen: np.ndarray) -> np.ndarray:
+        return cv2.resize(screen, (self.width, self.height), interpolation=cv2.INTER_LINEAR)  # (84, 84) uint8
+
+
+class RewardClip(gym.Wrapper):
+    """The reward is clipped to [-limit, limit]; the game's own stays in info["raw_reward"] (§7.2.1, training only)."""
+
+    def __init__(self, env: gym.Env, limit: float):
+        super().__init__(env)
+        self.limit = limit
+
+    def step(self, action: int):
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        return frame, min(max(reward, -self.limit), self.limit), terminated, truncated, info | {"raw_reward": reward}
+
+
+class LifeLoss(gym.Wrapper):
+    """A lost life terminates the episode, and the game goes on (§7.2.1, training only). info["game_over"] tells a
+    game's end from a life's. Easy to get wrong: a reset() after a lost life must neither reset nor step the emulator,
+    or the later lives are never seen, or seen from a frame that no transition holds."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.lives, self.game_over = 0, True
+
+    def reset(self, **kwargs):
+        if self.game_over:
+            self.frame, self.info = self.env.reset(**kwargs)
+            self.lives, self.game_over = self.info["lives"], False
+        return self.frame, self.info
+
+    def step(self, action: int):
+        self.frame, reward, terminated, truncated, self.info = self.env.step(action)
+        life_lost = self.info["lives"] < self.lives
+        self.lives, self.game_over = self.info["lives"], terminated or truncated
+        self.info["game_over"] = self.game_over
+        return self.frame, reward, terminated or life_lost, truncated, self.info
+
+
+class FrameHistory(gym.Wrapper):
+    """The state: references to the last `length` encoded frames, oldest first (§7.3.2). A frame is encoded once, when
+    it arrives, and never changed; acting and replay decode the same objects. An episode starts with `length` references
+    to its first frame."""
+
+    def __init__(self, env: gym.Env, length: int, encode):
+        super().__init__(env)
+        self.length, self.encode = length, encode
+
+    def reset(self, **kwargs):
+        frame, info = self.env.reset(**kwargs)
+        self.history = (self.encode(frame),) * self.length
+        return self.history, info
+
+    def step(self, action: int):
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        self.history = (*self.history[1:], self.encode(frame))
+        return self.history, reward, terminated, truncated, info
+
+
+def make_emulator(env_id: str) -> gym.Env:
+    """The bare game at 60 frames a second: nothing skipped, no action repeated at random, truncated after 108,000
+    emulator frames. Raises ValueError for a name that is no Atari game."""
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
+    games = [name for name, spec in gym.registry.items() if spec.entry_point == "ale_py.env:AtariEnv"]
+    if env_id not in games:
+        if env_id in gym.registry:
+            raise ValueError(f"{env_id} is no Atari game")
+        near = difflib.get_close_matches(env_id, games, n=3, cutoff=0.5)
+        raise ValueError(f"unknown game {env_id!r}" + (f"; near names: {', '.join(near)}" if near else ""))
+    return gym.make(env_id, frameskip=1, repeat_action_probability=0.0, full_action_space=False,
+                    max_num_frames_per_episode=108_000, disable_env_checker=True)
+
+
+def preprocess(env: gym.Env, args: Args, encode, rng: np.random.Generator, training: bool) -> gym.Env:
+    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the two ifs)."""
+    env = JoystickActions(env)
+    env = NoOpReset(env, args.environment_no_op_max, rng)
+    env = MaxPool(env, args.environment_frames_to_maxpool)
+    env = ActionRepeat(env, args.agent_action_repeat)
+    env = Greyscale(env)
+    env = Downsample(env, args.environment_state_height, args.environment_state_width)
+    if training:
+        env = RewardClip(env, args.environment_reward_clip_limit)
+        env = LifeLoss(env)
+    return FrameHistory(env, args.agent_history_length, encode)
+
+
+def wrapper(env: gym.Env, kind: type[gym.Wrapper]) -> gym.Wrapper:
+    """The wrapper of class `kind` in a stack."""
+    while not isinstance(env, kind):
+        env = env.env
+    return env
+
+
+# ---- memory: lazy replay ---------------------------------------------------------------------------
+
+
+def frame_encoding(name: str, height: int, width: int, device: torch.device):
+    """Return (encode, decode). encode: (height, width) uint8 array -> an immutable object; decode: n such objects ->
+    (n, height, width) uint8 tensor on `device`."""
+    size = height * width
+    encode, decode = {
+        "lz4": (lambda frame: lz4.block.compress(frame, store_size=False),
+                lambda codes: torch.frombuffer(bytearray().join(
+                    [lz4.block.decompress(code, uncompressed_size=size) for code in codes]), dtype=torch.uint8)),
+        "raw": (lambda frame: frame, lambda codes: torch.from_numpy(np.stack(codes))),
+        "tensor": (lambda frame: torch.from_numpy(frame).to(device), torch.stack),
+    }[name]
+    return encode, lambda codes: decode(codes).view(-1, height, width).to(device)
+
+
+def to_bytes(code) -> bytes:
+    """An encoded frame as LZ4 bytes, for a checkpoint."""
+    if isinstance(code, bytes):
+        return code
+    return lz4.block.compress(np.asarray(code.cpu() if torch.is_tensor(code) else code), store_size=False)
+
+
+def from_bytes(blob: bytes, encoding_name: str, shape: tuple[int, int], encode) -> object:
+    """The encoded frame that `to_bytes` was given."""
+    if encoding_name == "lz4":
+        return blob
+    frame = bytearray(lz4.block.decompress(blob, uncompressed_size=shape[0] * shape[1]))
+    return encode(np.frombuffer(frame, np.uint8).reshape(shape))
+
+
+class ReplayMemory:
+    """𝒟: the last `capacity` transitions (§5.3). A transition is references to its `agent_history_length + 1` encoded
+    frames, an action, a clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
+    Every transition is whole in itself: none can mix two episodes or span the place where the oldest is overwritten."""
+
+    def __init__(self, capacity: int, decode):
+        self.capacity, self.decode, self.added = capacity, decode, 0
+        self.frames = [()] * capacity  # per transition: x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}
+        self.actions = np.zeros(capacity, np.int64)
+        self.rewards = np.zeros(capacity, np.float32)
+        self.terminals = np.zeros(capacity, np.bool_)
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def add(self, state: tuple, action: int, reward: float, next_state: tuple, terminal: bool) -> None:
+        """Store (s, a, r, s'). Easy to get wrong: `terminal` must not be set by truncation, or a game that was cut off
+        teaches that its last state is worth nothing."""
+        i = self.added % self.capacity
+        self.frames[i] = (*state, next_state[-1])
+        self.actions[i], self.rewards[i], self.terminals[i] = action, reward, terminal
+        self.added += 1
+
+    def sample(self, size: int, rng: np.random.Generator) -> tuple[torch.Tensor, ...]:
+        """Draw ℬ uniformly with replacement: s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32, s' like s, terminal
+        (B,) bool, on the device."""
+        return self.gather(rng.integers(len(self), size=size))
+
+    def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
+        """The transitions at `indices` (B,), as `sample` returns them."""
+        codes = [code for i in indices for code in self.frames[i]]
+        frames = self.decode(codes).unflatten(0, (len(indices), -1))  # (B, 5, 84, 84) uint8
+        columns = [torch.from_numpy(column[indices]).to(frames.device, non_blocking=True)
+                   for column in (self.actions, self.rewards, self.terminals)]
+        return frames[:, :-1], columns[0], columns[1], frames[:, 1:], columns[2]
+
+
+def most_recent(replay: ReplayMemory, size: int) -> np.ndarray:
+    """Indices of the last `size` transitions, oldest first (size,): the minibatch of an agent without replay buffer."""
+    return np.arange(replay.added - size, replay.added) % replay.capacity  # (size,)
+
+
+# ---- network ---------------------------------------------------------------------------------------
+
+
+class QNetwork(nn.Module):
+    """Table 2: (B, 4, 84, 84) uint8 states to (B, num_actions) float32 values Q(s, ·; θ)."""
+
+    def __init__(self, history_length: int, height: int, width: int, num_actions: int):
+        super().__init__()
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
+        self.layers = nn.Sequential(OrderedDict(
+            conv1=nn.Conv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
+            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),              # (B, 64, 9, 9)
+            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),              # (B, 64, 7, 7)
+            flatten=nn.Flatten(),                                                                # (B, 3136)
+            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                   # (B, 512)
+        ))
+        self.head = nn.Linear(512, num_actions)                                                  # (B, num_actions)
+
+    def forward(self, states: torch.Tensor) -> torch.Tensor:
+        x = states.to(self.layers.conv1.weight.dtype) / 255           # (B, 4, 84, 84) in [0, 1]
+        return self.head(self.layers(x).to(self.head.weight.dtype))   # (B, num_actions) float32
+
+
+def initialize_orthogonal(q_network: QNetwork) -> None:
+    """Orthogonal convolution filters, the best of Table 4 (§7.5.1); everything else stays PyTorch's default."""
+    for layer in q_network.layers:
+        if isinstance(layer, nn.Conv2d):
+            nn.init.orthogonal_(layer.weight)
+
+
+def initialize_he(q_network: QNetwork) -> None:
+    """He-normal convolution filters, variance 2 / fan-in (Table 4, §7.5.1); everything else stays PyTorch's default."""
+    for layer in q_network.layers:
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+
+
+# ---- algorithm: deep Q-learning --------------------------------------------------------------------
+
+
+class NatureRMSprop(torch.optim.Optimizer):
+    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the root. (PyTorch's own
+    adds it outside, and "gradient momentum 0.95" is the decay of the mean gradient, no momentum of the step.)"""
+
+    def __init__(self, parameters, lr: float, mean_decay: float, square_decay: float, constant: float):
+        super().__init__(parameters, dict(lr=lr, mean_decay=mean_decay, square_decay=square_decay, constant=constant))
+
+    @torch.no_grad()
+    def step(self) -> None:
+        for group in self.param_groups:
+            for θ in group["params"]:
+                state = self.state[θ]
+                if not state:
+                    state["g"], state["n"] = torch.zeros_like(θ), torch.zeros_like(θ)
+                # g ← 0.95 g + 0.05 ∇        n ← 0.95 n + 0.05 ∇²        θ ← θ - lr ∇ / √(n - g² + 0.01)
+                state["g"].lerp_(θ.grad, 1 - group["mean_decay"])
+                state["n"].lerp_(θ.grad.square(), 1 - group["square_decay"])
+                root = (state["n"] - state["g"].square() + group["constant"]).sqrt()
+                θ.addcdiv_(θ.grad, root, value=-group["lr"])
+
+
+def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
+    """Table 3's Adam, or Figure 18's RMSProp."""
+    if args.optimizer_name == "Adam":
+        return torch.optim.Adam(q_network.parameters(), lr=args.optimizer_learning_rate, fused=True)
+    return NatureRMSprop(q_network.parameters(), args.optimizer_learning_rate, args.optimizer_gradient_momentum,
+                         args.optimizer_squared_gradient_momentum, args.optimizer_min_squared_gradient)
+
+
+def epsilon_at(frame: int, args: Args) -> float:
+    """ε at a frame: linear from ε_initial at frame 0 to ε_final at frame `agent_epsilon_greedy_annealing`, then
+    constant (Algorithm 6, lines 11-13)."""
+    annealed = min(frame / args.agent_epsilon_greedy_annealing, 1.0)
+    initial, final = args.agent_epsilon_greedy_epsilon_initial, args.agent_epsilon_greedy_epsilon_final
+    return initial + annealed * (final - initial)
+
+
+@torch.inference_mode()
+def greedy_action(q_network: QNetwork, state: torch.Tensor) -> int:
+    """π(s) = argmax_a Q(s, a; θ) (Equation 35) of one state (4, 84, 84) uint8."""
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # an accelerator is waited for here, and nowhere else
+
+
+def update(q_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer, minibatch: tuple,
+           discount: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """One optimization iteration (Algorithm 6, lines 19-22), in the precision of the target network's layers. Returns
+    the minibatch's mean Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
+    s, a, r, s_next, terminal = minibatch
+
+    # y_j = r_j                                      if s_{j+1} is terminal
+    #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)        else                                   (Equation 37)
+    with torch.no_grad():
+        y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
+
+    # Q(s_j, a_j; θ). θ is float32; its cast to the target network's type is part of the graph, so its gradient is too
+    types = {name: parameter.dtype for name, parameter in target_network.named_parameters()}
+    θ = {name: parameter.to(types[name]) for name, parameter in q_network.named_parameters()}
+    q = functional_call(q_network, θ, (s,)).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
+
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1].
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the mean of the minibatch.
+    assert q.shape == y.shape == r.shape
+    loss = F.huber_loss(q, y, reduction="sum")  # ()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss.detach() / len(r), q.detach()
+
+
+@torch.no_grad()
+def diagnose(q_network: QNetwork, states: torch.Tensor) -> dict[str, float]:
+    """How alive the network is on a minibatch of states (B, 4, 84, 84): of every layer the share of its units (filters)
+    that are 0 in every state, and the standard deviation of Q over the states, mean over actions. If a whole layer is
+    dead, Q is the same in every state and no gradient passes: nothing will ever be learnt."""
+    scalars = {}
+    x = states.float() / 255
+    for name, layer in q_network.layers.named_children():
+        x = layer(x)  # (B, units, …)
+        if isinstance(layer, nn.ReLU):
+            alive = (x > 0).transpose(0, 1).flatten(1).any(dim=1)  # (units,)
+            scalars[f"diagnostics/dead_units_{name.removesuffix('_relu')}"] = 1 - alive.float().mean().item()
+    scalars["diagnostics/q_spread"] = q_network.head(x).std(dim=0).mean().item()
+    return scalars
+
+
+# ---- evaluation ------------------------------------------------------------------------------------
+
+
+def evaluate(args: Args, q_network: QNetwork, encoding: tuple, number: int, stop: Stop, games: int | None = None,
+             frames: int | None = None) -> list[tuple[float, int]] | None:
+    """Play whole games at ε_evaluation for raw reward until `games` are finished or `frames` have passed; an unfinished
+    game does not count. It depends on the network, the seed and its own `number` alone. Returns (score, length in
+    frames) per game, or None if it was stopped."""
+    encode, decode = encoding
+    exploration, no_ops = (np.random.default_rng(s) for s in np.random.SeedSequence([args.seed, number]).spawn(2))
+    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=False)
+    finished, score, length = [], 0.0, 0
+    state, _ = env.reset(seed=args.seed + number)
+    with tqdm(itertools.count() if frames is None else range(frames), desc="evaluation" if number else "final test",
+              unit="frame", leave=False, **bar_style()) as bar:
+        for _ in bar:
+            if exploration.random() < args.agent_epsilon_greedy_epsilon_evaluation:
+                action = int(exploration.integers(env.action_space.n))
+            else:
+                action = greedy_action(q_network, decode(state))
+            state, reward, terminated, truncated, _ = env.step(action)
+            score, length = score + reward, length + 1
+            if terminated or truncated:
+                finished.append((score, length))
+                bar.set_postfix_str(f"{len(finished)} games, last score {score:g}", refresh=False)
+                score, length = 0.0, 0
+                state, _ = env.reset()
+            if len(finished) == games or stop.signum:
+                break
+    env.close()
+    return None if stop.signum else finished
+
+
+def held_out_states(args: Args, encoding: tuple) -> torch.Tensor:
+    """`HELD_OUT_STATES` states (n, 4, 84, 84) uint8 that a random policy meets. Game and generators are their own, so
+    training is the same with and without them; they depend on the seed alone, so a resumed run has the same ones."""
+    encode, decode = encoding
+    fourth = np.random.SeedSequence(args.seed).spawn(4)[3]  # the first three are main's
+    policy, no_ops = (np.random.default_rng(seed) for seed in fourth.spawn(2))
+    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=True)
+    state, _ = env.reset(seed=args.seed)
+    states = []
+    for frame in tqdm(range(HELD_OUT_STATES * HELD_OUT_INTERVAL), desc="held-out states", unit="frame", leave=False,
+                      **bar_style()):
+        state, _, terminated, truncated, _ = env.step(int(policy.integers(env.action_space.n)))
+        if frame % HELD_OUT_INTERVAL == 0:
+            states.append(decode(state))  # (4, 84, 84)
+        if terminated or truncated:
+            state, _ = env.reset()
+    env.close()
+    return torch.stack(states)
+
+
+@torch.inference_mode()
+def mean_max_q(q_network: QNetwork, states: torch.Tensor) -> float:
+    """Mean over `states` (n, 4, 84, 84) of max_a Q(s, a; θ). Clipped rewards bound what it can honestly be: what grows
+    and grows has lost its footing."""
+    return q_network(states).amax(dim=1).mean().item()
+
+
+# ---- report and checkpoint -------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Counters:
+    """Everything that the loop counts; saved whole in a checkpoint."""
+
+    frames: int = 0
+    updates: int = 0
+    episodes: int = 0
+    evaluations: int = 0
+    evaluation_episodes: int = 0  # `episodes` at the last evaluation
+    checkpoint_episodes: int = 0  # `episodes` at the last checkpoint
+    game_score: float = 0.0  # raw, of the game now being played
+    game_length: int = 0  # frames
+    recent_scores: list[float] = dataclasses.field(default_factory=list)  # of the last 20 games
+    evaluation_rows: list[dict] = dataclasses.field(default_factory=list)  # of evaluations.csv
+    seconds: float = 0.0  # of wall-clock, evaluations included, pauses between resumes not
+    peak_memory: int = 0  # bytes resident
+
+
+def evaluation_row(counters: Counters, finished: list[tuple[float, int]]) -> dict:
+    """A row of evaluations.csv; the mean and (population) variance of score and of length in frames are the columns of
+    Tables 4-6, None without a finished game."""
+    row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
+    for i, name in enumerate(("score", "length")):
+        values = [game[i] for game in finished]
+        row[f"{name}_mean"] = float(np.mean(values)) if values else None
+        row[f"{name}_variance"] = float(np.var(values)) if values else None
+    return row | {"seconds": round(counters.seconds, 1)}
+
+
+class Stop:
+    """SIGINT or SIGTERM asks the loop to end at the next frame; a second one ends the process at once."""
+
+    def __init__(self):
+        self.signum = 0
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signum, self)
+
+    def __call__(self, signum: int, _frame) -> None:
+        self.signum = signum
+        signal.signal(signum, signal.SIG_DFL)
+
+
+def bar_style() -> dict:
+    """tqdm's settings: a live bar in a terminal, a line a minute in a log."""
+    return dict(mininterval=0.5 if sys.stderr.isatty() else 60, dynamic_ncols=True, smoothing=0.05)
+
+
+def attempt(what: str, write) -> bool:
+    """Call write(); if the disk refuses, say so in one line and go on: it is tried again at the next occasion."""
+    try:
+        write()
+        return True
+    except OSError as error:
+        reason = error.strerror or error
+        tqdm.write(f"warning: {what} could not be written ({reason}); training goes on", file=sys.stderr)
+        return False
+
+
+class Curves:
+    """TensorBoard's event file. A full disk costs points of a curve, never the run."""
+
+    def __init__(self, run_dir: Path, first_frame: int):
+        # what a killed process logged after its last checkpoint is logged again: purge_step hides the first copy
+        self.run_dir, self.writer = run_dir, SummaryWriter(run_dir, purge_step=first_frame or None)
+
+    def write(self, add) -> None:
+        """Call add(writer); after a failure the next call begins a new event file."""
+        self.writer = self.writer or SummaryWriter(self.run_dir)
+        if not attempt("a point of the curves", lambda: add(self.writer)):
+            self.writer = None
+
+    def add(self, scalars: dict[str, float], frame: int) -> None:
+        """Log scalars at a frame."""
+        self.write(lambda writer: [writer.add_scalar(name, value, frame) for name, value in scalars.items()])
+
+    def add_table(self, name: str, rows: dict, frame: int) -> None:
+        """Log a table of names and values."""
+        text = "\n".join(["name | value", "--- | ---", *(f"{key} | {value}" for key, value in rows.items())])
+        self.write(lambda writer: writer.add_text(name, text, frame))
+
+    def flush(self) -> None:
+        """Bring everything logged so far to the file."""
+        self.write(lambda writer: writer.flush())
+
+
+def write_atomically(path: Path, write) -> None:
+    """write(file) into a temporary file beside `path`, bring it to the disk, then rename: a crash or a full disk leaves
+    the old file or the new one, never a part. Raises OSError."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb+") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    if os.name == "posix":  # so that the rename outlives a power cut; Windows has no handle of a directory
+        directory = os.open(path.parent, os.O_RDONLY)
+        os.fsync(directory)
+        os.close(directory)
+
+
+def save_tensors(content: dict, file) -> None:
+    """torch.save, whose RuntimeError for a write that the disk refused is made the OSError that it hides."""
+    try:
+        torch.save(content, file)
+    except RuntimeError as error:
+        raise error.__context__ if isinstance(error.__context__, OSError) else OSError(str(error)) from None
+
+
+def write_json(path: Path, content: dict) -> None:
+    """Atomically write an indented JSON file."""
+    write_atomically(path, lambda file: file.write((json.dumps(content, indent=2) + "\n").encode()))
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    """Atomically write rows under one header."""
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, rows[0], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+
+def environment_state(env: gym.Env) -> dict:
+    """What the emulator and the wrappers remember between two frames, beside the history and the generators."""
+    return {"emulator": env.unwrapped.ale.cloneState(include_rng=True).serialize(),
+            "lives": wrapper(env, LifeLoss).lives,
+            "screens": [torch.from_numpy(screen) for screen in wrapper(env, MaxPool).screens]}
+
+
+def restore_environment(env: gym.Env, state: dict, history: tuple) -> None:
+    """Put `env` where `environment_state` was taken."""
+    env.reset()
+    env.unwrapped.ale.restoreState(ale_py.ALEState(state["emulator"]))
+    wrapper(env, LifeLoss).lives = state["lives"]
+    wrapper(env, MaxPool).screens.clear()
+    wrapper(env, MaxPool).screens.extend(screen.numpy() for screen in state["screens"])
+    env.history = history
+
+
+def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tuple) -> None:
+    """One file that torch.load(weights_only=True) reads, with the encoded frames, each once, as one more member of
+    PyTorch's zip archive: they are streamed, so a million of them need no second copy in memory, and the archive's
+    CRC-32 guards every member. Raises OSError."""
+    blobs = []
+
+    def add(code) -> int:
+        blobs.append(to_bytes(code))
+        return len(blobs) - 1
+
+    def number(codes: tuple, before: tuple, row: list[int]) -> list[int]:
+        """The places of `codes` in `blobs`, given those of the transition before: only neighbours share frames."""
+        if row and all(map(operator.is_, codes, before[1:])):
+            return [*row[1:], *map(add, codes[len(before) - 1 :])]
+        places = {key: add(code) for key, code in {id(code): code for code in codes}.items()}
+        return [places[id(code)] for code in codes]
+
+    length, before, row = len(replay), (), []
+    indices = np.empty((length, len(history) + 1), np.int32)
+    for i, codes in enumerate(replay.frames[:length]):
+        indices[i] = row = number(codes, before, row)
+        before = codes
+    last = (replay.added - 1) % replay.capacity
+    now = number(history, replay.frames[last], indices[last].tolist()) if length else number(history, (), [])
+    columns = {"indices": indices, "actions": replay.actions[:length], "rewards": replay.rewards[:length],
+               "terminals": replay.terminals[:length], "lengths": np.fromiter(map(len, blobs), np.int32)}
+    state = state | {"format": CHECKPOINT_FORMAT, "history": now, "added": replay.added,
+                     "replay": {name: torch.from_numpy(column) for name, column in columns.items()}}
+
+    def write(file) -> None:
+        save_tensors(state, file)
+        with zipfile.ZipFile(file, "a") as archive, archive.open("archive/frames", "w", force_zip64=True) as member:
+            for start in range(0, len(blobs), 4096):
+                member.write(b"".join(blobs[start : start + 4096]))
+
+    write_atomically(path, write)
+
+
+def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
+    """Return the state and the encoded frames that `save_checkpoint` wrote. Every member's checksum is compared first,
+    and nothing in the file is run (weights_only). Raises ValueError with one line for whatever is no whole
+    checkpoint."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+            if damaged:
+                raise ValueError(f"the checksum of its member {damaged} is wrong")
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            if state["format"] != CHECKPOINT_FORMAT:
+                raise ValueError(f"its format is {state['format']!r}, this script reads {CHECKPOINT_FORMAT!r}")
+            with io.BufferedReader(archive.open("archive/frames"), 1 << 20) as member:
+                return state, [member.read(length) for length in state["replay"]["lengths"].tolist()]
+    except Exception as error:  # a damaged file can raise anything; none of it is a reason to go on
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path} cannot be resumed from: {reason}") from None
+
+
+def restore_run(saved: dict, codes: list, replay: ReplayMemory, env: gym.Env, generators: list, learnt: dict) -> tuple:
+    """Put everything where the checkpoint was taken; `codes` are its frames, encoded for `replay`. Returns the state.
+    Raises ValueError, with the part's name, for a part that does not fit."""
+    part = "replay"
+    try:
+        columns = {name: column.numpy() for name, column in saved["replay"].items()}
+        replay.added = saved["added"]
+        for i, row in enumerate(columns["indices"].tolist()):
+            replay.frames[i] = tuple(codes[number] for number in row)
+        for name in ("actions", "rewards", "terminals"):
+            getattr(replay, name)[: len(replay)] = columns[name]
+        state = tuple(codes[number] for number in saved["history"])
+        part = "environment"
+        restore_environment(env, saved["environment"], state)
+        for part, of_part in learnt.items():
+            of_part.load_state_dict(saved[part])
+        part = "generators"
+        for generator, generator_state in zip(generators, saved["generators"], strict=True):
+            generator.bit_generator.state = generator_state
+    except Exception as error:  # whatever it is, it is no reason to go on from half a state
+        raise ValueError(f"its {part} does not fit ({str(error).splitlines()[0]})") from None
+    return state
+
+
+def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
+    """The run directory, `args.resume` or a new one, and the lock on it, which the kernel releases when the process
+    dies. Raises ValueError if it cannot be written or another process writes it."""
+    name = f"{args.env_id.replace('/', '-')}__{script}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = Path(args.resume) if args.resume else Path(args.runs_dir) / name
+    if args.resume and not (run_dir / "args.json").is_file():
+        raise ValueError(f"--resume {run_dir}: no run directory, it has no args.json")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
+        lock = filelock.FileLock(run_dir / ".lock")
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise ValueError(f"another process is writing {run_dir}") from None
+    except OSError as error:
+        raise ValueError(f"the run directory {run_dir} cannot be written: {error.strerror or error}") from None
+    return run_dir, lock
+
+
+def resumed_args(args_class: type[Flags], run_dir: Path) -> Flags:
+    """The flags of the run in `run_dir`, with --environment-train-frames-max raised if the command line does. Raises
+    ValueError for any other flag that contradicts the run's own."""
+    try:
+        saved = args_class(**json.loads((run_dir / "args.json").read_text()))
+        given = dataclasses.replace(tyro.cli(args_class, default=saved), resume="")
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{run_dir / 'args.json'} is no record of this script's flags: {error}") from None
+    for name, value in vars(given).items():
+        own = getattr(saved, name)
+        if value != own and not (name == "environment_train_frames_max" and value > own):
+            raise ValueError(f"{flag(name)} {value} contradicts the run's own {own}; "
+                             f"only --environment-train-frames-max may be raised")
+    return given
+
+
+def load_run(args: Args, run_dir: Path) -> tuple[dict, list[bytes]]:
+    """The state and the encoded frames of the run in `run_dir`. Raises ValueError if there are none, or another's."""
+    path = run_dir / "checkpoint.pt"
+    if not path.exists():
+        raise ValueError(f"--resume {run_dir}: it was stopped before its first checkpoint; start it anew")
+    state, blobs = load_checkpoint(path)
+    for name, value in vars(args).items():
+        other = state["args"].get(name)
+        if other != value and name != "environment_train_frames_max":
+            raise ValueError(f"{path} is another run's: its {flag(name)} is {other}, args.json says {value}")
+    return state, blobs
+
+
+def gigabytes(count: float) -> str:
+    """A number of bytes for people."""
+    return f"{count / 1e9:.2f} GB"
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that are free on an NVIDIA GPU, or on the machine for whatever shares its memory."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+
+
+def frame_bytes(args: Args) -> float:
+    """Mean size of an LZ4 frame, over 200 frames of random play, as a Python object."""
+    rng = np.random.default_rng(0)
+    encode, _ = frame_encoding("lz4", args.environment_state_height, args.environment_state_width, torch.device("cpu"))
+    env = preprocess(make_emulator(args.env_id), args, encode, rng, training=True)
+    env.reset(seed=args.seed)
+    sizes = []
+    for _ in range(200):
+        history, _, terminated, truncated, _ = env.step(int(rng.integers(env.action_space.n)))
+        sizes.append(sys.getsizeof(history[-1]))
+        if terminated or truncated:
+            env.reset()
+    env.close()
+    return float(np.mean(sizes))
+
+
+def choose_encoding(args: Args, device: torch.device) -> tuple[str, float]:
+    """The replay encoding, and the bytes that a full memory needs with it. Raises ValueError if they are not free."""
+    cpu = torch.device("cpu")
+    transitions = min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max)
+    pixels = args.environment_state_height * args.environment_state_width
+    frame = {"lz4": frame_bytes(args), "raw": sys.getsizeof(np.empty(pixels, np.uint8)), "tensor": float(pixels)}
+    name = args.replay_encoding
+    if name == "auto":
+        fits = device.type != "cpu" and transitions * frame["tensor"] < 0.8 * free_memory(device)
+        name = "tensor" if fits else "lz4"
+    references = sys.getsizeof((None,) * (args.agent_history_length + 1)) + 16 + 8 + 8 + 4 + 1  # tuple, list, a, r, end
+    need, free = transitions * (frame[name] + references), free_memory(device if name == "tensor" else cpu)
+    if need > free:
+        raise ValueError(f"a replay memory of {transitions:,} transitions needs {gigabytes(need)}, {gigabytes(free)} "
+                         "are free; lower --agent-replay-buffer-maximum-length")
+    return name, need
+
+
+def choose_device(args: Args) -> tuple[torch.device, torch.dtype]:
+    """The device, and the type of the numbers inside an update."""
+    name = args.device
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
+    multiplies_bfloat16 = any(torch.cpu.get_capabilities().get(unit) for unit in ("avx512_bf16", "amx_bf16"))
+    use_bfloat16 = args.precision == "bfloat16" or (args.precision == "auto" and name == "cpu" and multiplies_bfloat16)
+    return torch.device(name), torch.bfloat16 if use_bfloat16 else torch.float32
+
+
+class Arm(NamedTuple):
+    """What Tables 4, 5 and 6 vary: a game by ALE's name, the convolutions' weights, what is there."""
+
+    game: str
+    initialization: str = "orthogonal"
+    target_network: bool = True
+    replay_buffer: bool = True
+
+
+# mean and variance of an episode's score, mean and variance of its length in frames
+LECTURE = {
+    Arm("Breakout", "default"): (11.174, 696.84, 480.43, 22894),  # Table 4
+    Arm("Breakout", "he"): (22.865, 749.63, 703.13, 87811),
+    Arm("Breakout"): (32.154, 3695.1, 576.92, 29401),  # Tables 4, 5 and 6
+    Arm("Enduro"): (258.63, 14905, 4500.0, 2782600),  # Table 5
+    Arm("Pong"): (19.083, 5.4014, 1875.0, 56022),
+    Arm("Riverraid"): (3459.4, 877420, 833.33, 37002),
+    Arm("SpaceInvaders"): (748.14, 30417, 882.35, 41330),
+    Arm("Breakout", target_network=False): (10.549, 1.4201, 639.81, 27774),  # Table 6
+    Arm("Breakout", replay_buffer=False): (7.4837, 3.9444, 438.31, 35112),
+    Arm("Breakout", target_network=False, replay_buffer=False): (10.701, 1.2104, 671.64, 38953),
+}
+COLUMNS = {"score_mean": "Episode Score Mean", "score_variance": "Episode Score Variance",
+           "length_mean": "Episode Length Mean", "length_variance": "Episode Length Variance"}
+INITIALIZATIONS = {"default": "PyTorch Default", "he": "He", "orthogonal": "Orthogonal"}
+GAMES = {"Breakout": "Breakout", "Enduro": "Enduro", "Pong": "Pong", "Riverraid": "River Raid",
+         "SpaceInvaders": "Space Invaders"}
+# scores of random play and of a person, those of DQN Zoo: they put five games on one scale
+RANDOM_AND_HUMAN = {"Breakout": (1.7, 30.5), "Enduro": (0.0, 860.5), "Pong": (-20.7, 14.6),
+                    "Riverraid": (1338.5, 17118.0), "SpaceInvaders": (148.0, 1668.7)}
+# what each study varies, in the order of its table's rows
+STUDIES = {
+    "initialization": [{"initialization": name} for name in INITIALIZATIONS],
+    "games": [{"env_id": f"{game}NoFrameskip-v4"} for game in GAMES],
+    "ablation": [{"target_network": target, "replay_buffer": replay} for replay in (True, False)
+                 for target in (True, False)],
+}
+# flags that the tables' rows tell apart, or that cannot change a score; runs that differ in any other are shown apart
+NOT_COMPARED = {
+    "initialization", "target_network", "replay_buffer", "env_id", "seed", "environment_train_frames_max",
+    "environment_evaluation_episodes", "environment_evaluation_interval_episodes",
+    "environment_checkpoint_interval_episodes", "device", "replay_encoding", "checkpoint_interval_minutes", "resume",
+    "runs_dir", "study", "seeds", "list", "table", "markdown", "figure"}
+
+
+def arm_folder(args: Args) -> str:
+    """The folder of an arm's runs: processes that start in the same second must not meet in one run directory."""
+    return "_".join([args.initialization, *(
+        f"no_{name}" for name in ("target_network", "replay_buffer") if not getattr(args, name))])
+
+
+def read_json_object(path: Path) -> dict:
+    """The object in a JSON file. Raises ValueError, in one line, if there is none."""
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} cannot be read: it holds no JSON object")
+    return content
+
+
+def started(folder: Path) -> str:
+    """The time in a run directory's name, which sorts as times do."""
+    return folder.name.rpartition("__")[2]
+
+
+def find_run(args: Args) -> str:
+    """The newest run directory in `args.runs_dir` with these very flags and a checkpoint; "" if there is none."""
+    for folder in sorted(Path(args.runs_dir).glob("*"), key=started, reverse=True):
+        if (folder / "args.json").exists() and (folder / "checkpoint.pt").exists():
+            saved = read_json_object(folder / "args.json")
+            frames = saved.get("environment_train_frames_max", math.inf)  # may be raised
+            if (frames <= args.environment_train_frames_max
+                    and saved == vars(args) | {"resume": "", "environment_train_frames_max": frames}):
+                return str(folder)
+    return ""
+
+
+def study_runs(args: Args) -> list[tuple[Args, list[str]]]:
+    """Flags and command line of every run of `args.study`: seed by seed, and for each seed all the arms."""
+    runs = []
+    for seed, changes in itertools.product(range(args.seed, args.seed + args.seeds), STUDIES[args.study]):
+        arm = dataclasses.replace(args, seed=seed, resume="auto", study="", seeds=1, list=False, **changes)
+        arm.runs_dir = str(Path(args.runs_dir) / arm_folder(arm))
+        command = [sys.executable, __file__]
+        for name, value in vars(arm).items():
+            if isinstance(value, bool) and value != getattr(Args, name):
+                command.append(flag(name if value else f"no_{name}"))
+            elif value != getattr(Args, name):
+                command += [flag(name), str(value)]
+        runs.append((arm, command))
+    return runs
+
+
+def run_study(args: Args) -> None:
+    """Run every command of the study, each in a process of its own, or print them for a cluster (--list). What has
+    finished is skipped, what was cut off goes on."""
+    runs = study_runs(args)
+    if args.list:
+        print("\n".join(shlex.join(command) for _, command in runs))
+        return
+    stop, failed = Stop(), 0
+    for number, (arm, command) in enumerate(runs, 1):
+        run_dir = find_run(arm)
+        test = Path(run_dir, "test.json")
+        finished = (run_dir and test.exists()
+                    and read_json_object(test).get("frames", 0) >= arm.environment_train_frames_max)
+        print(f"run {number} of {len(runs)}: {arm.env_id}, {arm_folder(arm)}, seed {arm.seed}"
+              + (f": finished, {run_dir}" if finished else ""), flush=True)
+        if finished:
+            continue
+        process = subprocess.Popen(command)
+        while process.poll() is None and not stop.signum:
+            time.sleep(0.1)
+        if stop.signum == signal.SIGTERM:
+            process.terminate()  # Ctrl-C has reached it already: a terminal sends SIGINT to both
+        failed += process.wait() != 0
+        if stop.signum:
+            print("stopped; the same command goes on")
+            raise SystemExit(128 + stop.signum)
+    if failed:
+        print(f"error: {failed} of {len(runs)} runs ended before their time; the same command tries again",
+              file=sys.stderr)
+        raise SystemExit(1)
+
+
+@dataclasses.dataclass
+class MeasuredRun:
+    """What --table reads of a run directory."""
+
+    folder: Path
+    arm: Arm
+    seed: int
+    label: str  # frames and the flags that make it another experiment
+    test: dict | None  # test.json; None while the run goes on
+    evaluations: list[dict[str, str]]  # evaluations.csv
+
+
+def game_of(env_id: str) -> str:
+    """ALE's name of a game: Breakout for BreakoutNoFrameskip-v4 and for ALE/Breakout-v5."""
+    return re.sub(r"^ALE/|(NoFrameskip)?-v\d+$", "", env_id)
+
+
+def read_run(folder: Path) -> MeasuredRun:
+    """Read a run directory. Raises ValueError with the file's name for a file that is broken."""
+    test = read_json_object(folder / "test.json") if (folder / "test.json").exists() else None
+    source = folder / ("test.json" if test and "args" in test else "args.json")
+    try:
+        args = Args(**(test["args"] if source.name == "test.json" else read_json_object(source)))
+        frames = args.environment_train_frames_max
+        if test:
+            source, frames = folder / "test.json", int(test["frames"])
+            for name in COLUMNS:
+                test[name] = None if test[name] is None else float(test[name])
+        others = [f"{flag(name)} {value}" for name, value in vars(args).items()
+                  if name not in NOT_COMPARED and value != getattr(Args, name)]
+        arm = Arm(game_of(args.env_id), args.initialization, args.target_network, args.replay_buffer)
+        source, evaluations = folder / "evaluations.csv", []
+        if source.exists():
+            evaluations = list(csv.DictReader(io.StringIO(source.read_text())))
+            for row in evaluations:
+                float(row["frames"]), float(row["score_mean"]), float(row.get("held_out_max_q_mean", 0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{source} is broken: {type(error).__name__}: {error}") from None
+    return MeasuredRun(folder, arm, args.seed, ", ".join([f"{frames:,} frames", *others]), test, evaluations)
+
+
+def read_runs(folder: Path) -> list[MeasuredRun]:
+    """Every run below `folder`, oldest first. Raises ValueError if there is none, or if one is broken."""
+    if not folder.is_dir():
+        raise ValueError(f"--table {folder}: no such folder")
+    folders = {path.parent for name in ("test.json", "evaluations.csv") for path in folder.rglob(name)}
+    if not folders:
+        raise ValueError(f"--table {folder}: no test.json below it")
+    return [read_run(path) for path in sorted(folders, key=lambda path: (started(path), path))]
+
+
+def layouts(arms: set[Arm], complete: bool) -> list[tuple[str, tuple[str, ...], dict[Arm, tuple[str, ...]]]]:
+    """The tables that `arms` have something for, or the lecture's three if `complete`: title, names of the first
+    columns, and each row's first cells."""
+    games = GAMES | {game: game for game in sorted({arm.game for arm in arms} - GAMES.keys())}
+    shown = []
+    for game, name in games.items():
+        methods = {Arm(game, i): (title,) for i, title in INITIALIZATIONS.items()}
+        ablation = {Arm(game, **parts): tuple("Yes" if on else "No" for on in parts.values())
+                    for parts in STUDIES["ablation"]}
+        for title, first, rows in (("Table 4: Initialization Strategy Study", ("Initialization Method",), methods),
+                                   ("Table 6: Ablative Study", ("Target Network", "Replay Buffer"), ablation)):
+            if arms & (rows.keys() - {Arm(game)}) or (complete and rows.keys() <= LECTURE.keys()):
+                shown.append((f"{title} on {name}", first, rows))
+    rows = {Arm(game): (name,) for game, name in games.items()}
+    if complete or arms & rows.keys() - {arm for table in shown for arm in table[2]}:
+        shown.append(("Table 5: Game Performance Comparison", ("Game",), rows))
+    return sorted(shown, key=lambda table: table[0])
+
+
+def interquartile_mean(scores: np.ndarray) -> np.ndarray:
+    """Mean of the middle half along the last axis: a quarter, rounded down, is cut off at each end."""
+    cut = scores.shape[-1] // 4
+    return np.sort(scores, axis=-1)[..., cut : scores.shape[-1] - cut].mean(axis=-1)
+
+
+def iqm_interval(strata: list[list[float]], resamples: int = 50_000) -> str:
+    """Interquartile mean over all scores with its 95% stratified bootstrap interval (Agarwal et al., 2021): the runs of
+    each stratum, a game, are drawn anew with replacement, the strata themselves are not."""
+    rng = np.random.default_rng(0)
+    drawn = [rng.choice(scores, (resamples, len(scores))) for scores in strata]  # per stratum (resamples, seeds)
+    low, high = np.percentile(interquartile_mean(np.concatenate(drawn, axis=1)), (2.5, 97.5))
+    return f"{five_digits(interquartile_mean(np.concatenate(strata)))} [{five_digits(low)}, {five_digits(high)}]"
+
+
+def five_digits(value: float) -> str:
+    """Five digits, as in the lecture, and no power of ten."""
+    return f"{float(f'{value:.5g}'):,.10g}"
+
+
+def human_normalised(game: str, score: float) -> float:
+    """0 is random play, 1 is a person."""
+    random, human = RANDOM_AND_HUMAN[game]
+    return (score - random) / (human - random)
+
+
+def table_text(title: str, header: list[str], rows: list[list[str]], markdown: bool) -> str:
+    """A title and a table, as Markdown or with columns that line up."""
+    if markdown:
+        lines = ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
+        return "\n".join([f"### {title}", "", *lines])
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    return "\n".join([title, *("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
+                               for cells in [header, ["-" * width for width in widths], *rows])])
+
+
+def tables_text(runs: list[MeasuredRun], markdown: bool) -> str:
+    """Tables 4, 5 and 6: per arm the mean over its seeds, the lecture's figure in brackets. Runs with other frames or
+    hyperparameters stand apart, under their own heading."""
+    full = f"{Args.environment_train_frames_max:,} frames"
+    counted, left_out, blocks = {}, [], []  # counted: label -> arm -> seed -> run
+    for run in runs:
+        if run.test is None or run.test["score_mean"] is None:
+            left_out.append(f"{run.folder}: " + ("no test yet" if run.test is None else "no game of its test ended"))
+            continue
+        seeds = counted.setdefault(run.label, {}).setdefault(run.arm, {})
+        if run.seed in seeds:
+            left_out.append(f"{seeds[run.seed].folder}: the same run as {run.folder}, which is newer")
+        seeds[run.seed] = run
+
+    for label in sorted(counted, key=lambda label: (label != full, label)):
+        arms, in_a_table = counted[label], set()
+        heading = (f"{label}, Table 3's hyperparameters: ours (the lecture's)" if label == full else
+                   f"Apart: {label}: ours (the lecture's, of {full} and Table 3's hyperparameters)")
+        blocks.append(f"## {heading}" if markdown else heading)
+        for title, first, rows in layouts(set(arms), complete=label == full):
+            cells = []
+            for arm, names in rows.items():
+                found, lecture = list(arms.get(arm, {}).values()), LECTURE.get(arm)
+                if not found and label != full:
+                    continue
+                row = [*names, str(len(found))]
+                for i, column in enumerate(COLUMNS):
+                    ours = five_digits(np.mean([run.test[column] for run in found])) if found else "-"
+                    row.append(ours + (f" ({five_digits(lecture[i])})" if lecture else ""))
+                row.append(iqm_interval([[run.test["score_mean"] for run in found]]) if len(found) >= 3 else "-")
+                cells.append(row)
+            in_a_table |= rows.keys()
+            header = [*first, "Seeds", *COLUMNS.values(), "IQM of Score [95%]"]
+            blocks.append(table_text(title, header, cells, markdown))
+            if first == ("Game",) and all(len(arms.get(Arm(game), ())) >= 3 for game in GAMES):
+                ours = [[human_normalised(game, run.test["score_mean"]) for run in arms[Arm(game)].values()]
+                        for game in GAMES]
+                lecture = np.array([human_normalised(game, LECTURE[Arm(game)][0]) for game in GAMES])
+                blocks.append("Human-normalised score, five games, IQM [95%]: "
+                              f"{iqm_interval(ours)} ({five_digits(interquartile_mean(lecture))})")
+        left_out += [f"{run.folder}: an arm that no table has" for arm in arms.keys() - in_a_table
+                     for run in arms[arm].values()]
+    if left_out:
+        blocks.append("\n".join(["## Not counted" if markdown else "Not counted", *(f"- {line}" for line in left_out)]))
+    return "\n\n".join(blocks)
+
+
+def draw_curves(runs: list[MeasuredRun], path: Path) -> None:
+    """Learning curves: a row of two panels per table, label and game, with the score and the mean max Q of the held-out
+    states over frames; one colour per arm, one line per run; the lecture's figure is a dashed line. Raises ValueError
+    if there is nothing to draw, OSError if the file cannot be written."""
+    panels = []
+    drawn = [run for run in runs if run.evaluations]
+    for label in sorted({run.label for run in drawn}):
+        for title, _, rows in layouts({run.arm for run in drawn if run.label == label}, complete=False):
+            games = [{arm: names} for arm, names in rows.items()] if title.startswith("Table 5") else [rows]
+            for arms in games:
+                of_panel = [run for run in drawn if run.label == label and run.arm in arms]
+                if of_panel:
+                    name = f"{title.partition(':')[0]}, {of_panel[0].arm.game}: {label}"
+                    panels.append((textwrap.fill(name, 75, break_on_hyphens=False), arms, of_panel))
+    if not panels:
+        raise ValueError("--figure: no evaluations.csv with a row in it, or none of an arm of Tables 4, 5 and 6")
+    figure = Figure(figsize=(12, 4 * len(panels)), layout="constrained")
+    for (title, arms, of_panel), (scores, values) in zip(panels, figure.subplots(len(panels), 2, squeeze=False),
+                                                         strict=True):
+        for i, (arm, names) in enumerate(arms.items()):
+            mine = [run for run in of_panel if run.arm == arm]
+            name = names[0] if len(names) == 1 else f"target network: {names[0]}, replay buffer: {names[1]}"
+            for j, run in enumerate(mine):
+                style = dict(color=f"C{i}", linewidth=1, marker=".", label=name if j == 0 else None)
+                frames = [float(row["frames"]) for row in run.evaluations]
+                scores.plot(frames, [float(row["score_mean"]) for row in run.evaluations], **style)
+                if "held_out_max_q_mean" in run.evaluations[0]:  # dqn_atari.py has no such column
+                    values.plot(frames, [float(row["held_out_max_q_mean"]) for row in run.evaluations], **style)
+            if mine and arm in LECTURE:
+                scores.axhline(LECTURE[arm][0], color=f"C{i}", linestyle="--", linewidth=0.8)
+        for panel, name in ((scores, "score (dashed: the lecture's test)"), (values, "mean max Q, held-out states")):
+            panel.set(xlabel="frames", ylabel=name)
+            panel.set_title(title, fontsize="small")
+        scores.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+
+
+def report_tables(args: Args) -> None:
+    """--table, and --figure with it."""
+    runs = read_runs(Path(args.table))
+    if args.figure:
+        try:
+            draw_curves(runs, Path(args.figure))
+        except OSError as error:
+            raise ValueError(f"--figure {args.figure} cannot be written: {error.strerror or error}") from None
+    print(tables_text(runs, args.markdown))
+
+
+# ---- main ------------------------------------------------------------------------------------------
+
+
+def main(args: Args) -> None:
+    """Algorithm 6, between what it needs and what it leaves behind; or --study, or --table."""
+    try:
+        check_ablation_args(args)
+        if args.table:
+            return report_tables(args)
+        if args.study:
+            return run_study(args)
+        if args.resume == "auto":
+            args = dataclasses.replace(args, resume=find_run(args))
+    except ValueError as error:
+        fail(str(error))
+    stop, resumed, saved = Stop(), args.resume, None
+    try:
+        if resumed:
+            run_dir, _lock = open_run(args, "")
+            args = resumed_args(Args, run_dir)
+            check_ablation_args(args)
+        device, precision = choose_device(args)
+        encoding_name, replay_bytes = choose_encoding(args, device)
+        if resumed:
+            saved, blobs = load_run(args, run_dir)
+        else:
+            run_dir, _lock = open_run(args, Path(__file__).stem)
+    except ValueError as error:
+        fail(str(error))
+    counters = Counters(**saved["counters"]) if saved else Counters()
+    if (run_dir / "test.json").exists() and counters.frames >= args.environment_train_frames_max:
+        print(f"{run_dir} has finished its {counters.frames:,} frames; --environment-train-frames-max trains on")
+        return
+
+    # 1  Initialize the Atari 2600 simulator.
+    shape = args.environment_state_height, args.environment_state_width
+    encode, decode = encoding = frame_encoding(encoding_name, *shape, device)
+    seeds = np.random.SeedSequence(args.seed).spawn(3)
+    exploration, minibatches, no_ops = generators = [np.random.default_rng(seed) for seed in seeds]
+    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=True)
+    actions = wrapper(env, JoystickActions).meanings
+    # 2  Initialize 𝒟.
+    replay = ReplayMemory(min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max), decode)
+    # 3  Initialize θ.
+    torch.manual_seed(args.seed)
+    q_network = QNetwork(args.agent_history_length, *shape, len(actions))
+    if args.initialization == "orthogonal":
+        initialize_orthogonal(q_network)
+    elif args.initialization == "he":
+        initialize_he(q_network)
+    q_network.to(device)
+    optimizer = make_optimizer(args, q_network)
+    # 4  θ⁻ = θ
+    target_network = copy.deepcopy(q_network).requires_grad_(False)
+    target_network.layers.to(precision)  # the head stays float32: Q keeps more than bfloat16's three digits
+
+    if saved:
+        learnt = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
+        codes = (from_bytes(blob, encoding_name, shape, encode) for blob in blobs)
+        try:
+            state = restore_run(saved, list(codes), replay, env, generators, learnt)
+        except ValueError as error:
+            fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
+        del saved, blobs
+    else:
+        state, _ = env.reset(seed=args.seed)
+    write_json(run_dir / "args.json", vars(args))
+
+    states = held_out_states(args, encoding)  # (500, 4, 84, 84) uint8
+    target_interval = (args.optimizer_q_network_parameter_update_interval_frames if args.target_network
+                       else args.agent_update_frequency)  # without a target network: θ⁻ = θ after every update
+
+    print(f"arm      {arm_folder(args)}\n"
+          f"game     {args.env_id}: {len(actions)} actions, {' '.join(actions)}\n"
+          f"device   {device}, {torch.get_num_threads()} threads; updates in {str(precision).removeprefix('torch.')}\n"
+          f"network  {sum(parameter.numel() for parameter in q_network.parameters()):,} parameters\n"
+          f"replay   {replay.capacity:,} transitions as {encoding_name}: about {gigabytes(replay_bytes)} when full, "
+          f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free\n"
+          f"run      {run_dir}" + (f", resumed at frame {counters.frames:,}" if resumed else ""), flush=True)
+
+    curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
+    curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
+    process, dead, loss = psutil.Process(), set(), None
+    clock = checkpoint_time = window_time = time.monotonic()
+    window = dataclasses.replace(counters)  # the counters when `window_time` began
+
+    def stop_if_not_finite() -> None:
+        """A NaN never leaves the weights again: end the run before one reaches a checkpoint."""
+        if loss is not None and not all(tensor.isfinite().all() for tensor in (loss, *q_network.parameters())):
+            bar.close()
+            print(f"error: the loss or a weight is not finite at frame {counters.frames:,}; the last checkpoint is "
+                  f"{run_dir / 'checkpoint.pt'}; lower --optimizer-learning-rate", file=sys.stderr)
+            raise SystemExit(1)
+
+    def count_seconds() -> None:
+        nonlocal clock
+        counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
+
+    def checkpoint() -> None:
+        """Write q_network.pt, all that is needed to play, and checkpoint.pt, all that is needed to go on."""
+        stop_if_not_finite()
+        count_seconds()
+        curves.flush()
+        common = {"args": vars(args), "q_network": q_network.state_dict()}
+        weights = common | {"format": Q_NETWORK_FORMAT, "actions": actions, "frames": counters.frames}
+        everything = common | {
+            "target_network": target_network.state_dict(), "optimizer": optimizer.state_dict(),
+            "counters": dataclasses.asdict(counters), "environment": environment_state(env),
+            "generators": [generator.bit_generator.state for generator in generators]}
+        attempt("q_network.pt", lambda: write_atomically(run_dir / "q_network.pt", lambda f: save_tensors(weights, f)))
+        attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
+
+    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
+               **bar_style())
+
+    # 8  while total_frames < number of frames to train
+    while counters.frames < args.environment_train_frames_max:
+        # 27-29  Evaluate the agent.
+        if counters.episodes - counters.evaluation_episodes >= args.environment_evaluation_interval_episodes:
+            finished = evaluate(args, q_network, encoding, counters.evaluations + 1, stop,
+                                games=args.environment_evaluation_episodes)
+            if finished is not None:
+                counters.evaluations += 1
+                counters.evaluation_episodes = counters.episodes
+                count_seconds()
+                row = evaluation_row(counters, finished) | {"held_out_max_q_mean": mean_max_q(q_network, states)}
+                counters.evaluation_rows.append(row)
+                attempt("evaluations.csv", lambda: write_csv(run_dir / "evaluations.csv", counters.evaluation_rows))
+                columns = ("score_mean", "score_variance", "length_mean", "held_out_max_q_mean")
+                curves.add({f"evaluation/{name}": row[name] for name in columns}, counters.frames)
+                tqdm.write(f"evaluation {counters.evaluations} at frame {counters.frames:,}, "
+                           f"update {counters.updates:,}, episode {counters.episodes:,}: "
+                           f"score {row['score_mean']:.2f} (variance {row['score_variance']:.4g}), "
+                           f"length {row['length_mean']:.1f} frames, "
+                           f"mean max Q of the held-out states {row['held_out_max_q_mean']:.4g}")
+        if stop.signum:
+            break
+        if (counters.episodes - counters.checkpoint_episodes >= args.environment_checkpoint_interval_episodes
+                or time.monotonic() - checkpoint_time >= 60 * args.checkpoint_interval_minutes):
+            counters.checkpoint_episodes = counters.episodes
+            checkpoint()
+            checkpoint_time = time.monotonic()
+
+        # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q_θ(s, a); reduce ε; add (s, a, r, s') to 𝒟.
+        epsilon = epsilon_at(counters.frames, args)
+        if exploration.random() < epsilon:
+            action = int(exploration.integers(len(actions)))
+        else:
+            action = greedy_action(q_network, decode(state))
+        next_state, reward, terminated, truncated, info = env.step(action)
+        replay.add(state, action, reward, next_state, terminated)
+        state = next_state
+
+        # 30  total_frames = total_frames + 1
+        counters.frames += 1
+        counters.game_length += 1
+        counters.game_score += info["raw_reward"]
+
+        # 14-17  If the episode has ended, reset.
+        if terminated or truncated:
+            counters.episodes += 1
+            state, _ = env.reset()
+            if info["game_over"]:
+                curves.add({"charts/episodic_return": counters.game_score,
+                            "charts/episodic_length": counters.game_length}, counters.frames)
+                counters.recent_scores = [*counters.recent_scores, counters.game_score][-20:]
+                counters.game_score, counters.game_length = 0.0, 0
+
+        # 18-23  If |𝒟| ≥ initial, sample ℬ ⊆ 𝒟, compute y and perform one iteration of gradient descent.
+        if len(replay) >= args.agent_replay_buffer_initial and counters.frames % args.agent_update_frequency == 0:
+            if args.replay_buffer:
+                minibatch = replay.sample(args.optimizer_minibatch_size, minibatches)
+            else:
+                minibatch = replay.gather(most_recent(replay, args.optimizer_minibatch_size))
+            loss, q = update(q_network, target_network, optimizer, minibatch, args.agent_discount_factor)
+            counters.updates += 1
+
+        # 24-26  θ⁻ = θ
+        if counters.frames % target_interval == 0:
+            target_network.load_state_dict(q_network.state_dict())
+
+        bar.update()
+        if counters.frames % LOG_INTERVAL == 0:
+            stop_if_not_finite()
+            seconds = time.monotonic() - window_time
+            frames_per_second = (counters.frames - window.frames) / seconds
+            updates_per_second = (counters.updates - window.updates) / seconds
+            window_time, window = time.monotonic(), dataclasses.replace(counters)
+            scalars = {"charts/epsilon": epsilon, "charts/frames_per_second": frames_per_second}
+            if loss is not None:
+                scalars |= {"losses/huber": loss.item(), "losses/q_values": q.mean().item()}
+                scalars |= diagnose(q_network, minibatch[0])
+            curves.add(scalars, counters.frames)
+            now_dead = {name for name, share in scalars.items() if "dead_units" in name and share == 1}
+            for name in sorted(now_dead - dead):
+                tqdm.write(f"warning: frame {counters.frames:,}: {name} is 1, Q is the same in every state and nothing "
+                           "more will be learnt; start again with a lower --optimizer-learning-rate", file=sys.stderr)
+            dead = now_dead
+            counters.peak_memory = max(counters.peak_memory, process.memory_info().rss)
+            score = f"{np.mean(counters.recent_scores):.1f}" if counters.recent_scores else "none yet"
+            bar.set_postfix_str(f"{frames_per_second:.0f} frames/s, {updates_per_second:.0f} updates/s, "
+                                f"ε {epsilon:.3f}, score {score}", refresh=False)
+
+    bar.close()
+    checkpoint()
+    if not stop.signum:
+        finished = evaluate(args, q_network, encoding, 0, stop, frames=args.environment_test_frames)
+    curves.flush()
+    if stop.signum:
+        print(f"stopped at frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
+        raise SystemExit(128 + stop.signum)
+
+    result = evaluation_row(counters, finished) | {"held_out_max_q_mean": mean_max_q(q_network, states)}
+    modules = (torch, np, gym, ale_py, cv2)
+    attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
+        "scores": [score for score, _ in finished], "lengths": [length for _, length in finished],
+        "seed": args.seed, "env_id": args.env_id, "device": f"{device}, {platform.machine()}, {os.cpu_count()} cores",
+        "versions": {"python": platform.python_version()} | {module.__name__: module.__version__ for module in modules},
+        "peak_memory_bytes": counters.peak_memory, "args": vars(args)}))
+    if not finished:
+        print(f"no game ended within --environment-test-frames {args.environment_test_frames:,}")
+        return
+    print(f"{'Game':<28}{'Episode Score Mean':>20}{'Variance':>12}{'Episode Length Mean':>21}{'Variance':>12}"
+          f"{'Games':>7}\n{args.env_id:<28}{result['score_mean']:>20.5g}{result['score_variance']:>12.5g}"
+          f"{result['length_mean']:>21.5g}{result['length_variance']:>12.5g}{len(finished):>7}")
+
+
+if __name__ == "__main__":
+    main(parse_args(Args))
