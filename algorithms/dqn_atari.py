@@ -54,6 +54,7 @@ import io
 import itertools
 import json
 import math
+import operator
 import os
 import platform
 import signal
@@ -772,24 +773,26 @@ def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tupl
     """One file that torch.load(weights_only=True) reads, with the encoded frames, each once, as one more member of
     PyTorch's zip archive: they are streamed, so a million of them need no second copy in memory, and the archive's
     CRC-32 guards every member. Raises OSError."""
-    blobs, numbers = [], {}
+    blobs = []
 
-    def number(codes: tuple) -> list[int]:
-        """Number a transition's frames. Only neighbours share frames, so only the last transition is remembered."""
-        nonlocal numbers
-        before, numbers = numbers, {}
-        for code in codes:
-            if id(code) not in before:
-                before[id(code)] = len(blobs)
-                blobs.append(to_bytes(code))
-            numbers[id(code)] = before[id(code)]
-        return [numbers[id(code)] for code in codes]
+    def add(code) -> int:
+        blobs.append(to_bytes(code))
+        return len(blobs) - 1
 
-    length = len(replay)
+    def number(codes: tuple, before: tuple, row: list[int]) -> list[int]:
+        """The places of `codes` in `blobs`, given those of the transition before: only neighbours share frames."""
+        if row and all(map(operator.is_, codes, before[1:])):
+            return [*row[1:], *map(add, codes[len(before) - 1 :])]
+        places = {key: add(code) for key, code in {id(code): code for code in codes}.items()}
+        return [places[id(code)] for code in codes]
+
+    length, before, row = len(replay), (), []
     indices = np.empty((length, len(history) + 1), np.int32)
     for i, codes in enumerate(replay.frames[:length]):
-        indices[i] = number(codes)
-    now = number(history)
+        indices[i] = row = number(codes, before, row)
+        before = codes
+    last = (replay.added - 1) % replay.capacity
+    now = number(history, replay.frames[last], indices[last].tolist()) if length else number(history, (), [])
     columns = {"indices": indices, "actions": replay.actions[:length], "rewards": replay.rewards[:length],
                "terminals": replay.terminals[:length], "lengths": np.fromiter(map(len, blobs), np.int32)}
     state = state | {"format": CHECKPOINT_FORMAT, "history": now, "added": replay.added,
@@ -816,7 +819,7 @@ def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
             state = torch.load(path, map_location="cpu", weights_only=True)
             if state["format"] != CHECKPOINT_FORMAT:
                 raise ValueError(f"its format is {state['format']!r}, this script reads {CHECKPOINT_FORMAT!r}")
-            with archive.open("archive/frames") as member:
+            with io.BufferedReader(archive.open("archive/frames"), 1 << 20) as member:
                 return state, [member.read(length) for length in state["replay"]["lengths"].tolist()]
     except Exception as error:  # a damaged file can raise anything; none of it is a reason to go on
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

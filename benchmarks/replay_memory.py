@@ -23,6 +23,7 @@ import tyro
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
+import dqn_atari as dqn
 
 
 @dataclasses.dataclass
@@ -35,35 +36,38 @@ class Args:
     """Used by the benchmark itself: measure one game in this process."""
 
 
-def fill(game: str, transitions: int) -> int:
-    """Bytes of resident memory that `transitions` of random play take."""
-    import dqn_atari as dqn
-
+def play(game: str, capacity: int, transitions: int):
+    """`transitions` of random play in a replay memory of `capacity`; returns (environment, memory, state)."""
     args = dqn.Args(env_id=f"{game}NoFrameskip-v4")
     rng = np.random.default_rng(0)
     encode, decode = dqn.frame_encoding("lz4", 84, 84, torch.device("cpu"))
     env = dqn.preprocess(dqn.make_emulator(args.env_id), args, encode, rng, training=True)
+    memory = dqn.ReplayMemory(capacity, decode)
     state, _ = env.reset(seed=1)
-    for _ in range(100):  # the emulator's own memory is not the replay's
-        if any(env.step(0)[2:4]):
-            env.reset()
-    state, _ = env.reset()
-    gc.collect()
-    before = psutil.Process().memory_info().rss
-    memory = dqn.ReplayMemory(transitions, decode)
     for _ in tqdm(range(transitions), desc=game, unit="frame", unit_scale=True):
         action = int(rng.integers(env.action_space.n))
         next_state, reward, terminated, truncated, _ = env.step(action)
         memory.add(state, action, reward, next_state, terminated)
         state = env.reset()[0] if terminated or truncated else next_state
+    return env, memory, state
+
+
+def resident(game: str, transitions: int) -> int:
+    """Bytes of resident memory that `transitions` take."""
+    play(game, 100, 100)  # the emulator's and the libraries' own memory is not the replay's
     gc.collect()
-    return psutil.Process().memory_info().rss - before
+    before = psutil.Process().memory_info().rss
+    kept = play(game, transitions, transitions)
+    gc.collect()
+    after = psutil.Process().memory_info().rss
+    del kept
+    return after - before
 
 
 def main(args: Args) -> None:
     """Measure each game in a process of its own and print the table."""
     if args.worker:
-        print(json.dumps(fill(args.games[0], args.transitions)))
+        print(json.dumps(resident(args.games[0], args.transitions)))
         return
     print(f"{args.transitions:,} transitions a game\n")
     print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
