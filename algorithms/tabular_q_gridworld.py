@@ -5,7 +5,46 @@
 #   "matplotlib>=3.9",
 # ]
 # ///
-"""DOC
+"""Tabular Q-learning: a robot learns GridWorld without being told its model (§5.2, Algorithm 5, Equations 34-36).
+
+Figure 9, the Q-values of each cell, and Figure 10, the policy, are printed and drawn, beside Q* by value iteration
+(§4.3), for here the model is known, though not to the learner. The world is that of Figures 2 and 3. Its rewards are
+in the lost pictures, but §5.2 says what the robot does: it goes left in (2,1), (3,1), (4,1) and (3,2). With the
+lecture's undiscounted Equation 34 and moves that slip in 2 of 10 cases, that policy is optimal if every step that does
+not end the episode pays between -0.0274 and -0.0221, and for no discount at a step reward of 0: hence --step-reward
+-0.025 (`python benchmarks/gridworld.py step-rewards` solves the model along the step reward, and prints all changes).
+
+    python algorithms/tabular_q_gridworld.py                        # 1,000 episodes, as for Figure 9
+    python algorithms/tabular_q_gridworld.py --episodes 200000      # until the policy is Figure 10's
+    python algorithms/tabular_q_gridworld.py --learning-rate 1 --learning-rate-exponent 0.7     # quick, and less exact
+    python algorithms/tabular_q_gridworld.py --step-reward -0.5     # a hurried robot; 0 and above -0.0221: a patient one
+    python algorithms/tabular_q_gridworld.py --slip-probability 0   # Figure 3, left
+    python algorithms/tabular_q_gridworld.py --env-id Taxi-v3 --episodes 5000 --learning-rate 1 --learning-rate-exponent 0
+    tensorboard --logdir runs
+
+Measured on one core of an x86-64 machine (Python 3.11, Gymnasium 1.4.0, NumPy 2.4), by `python benchmarks/gridworld.py`:
+- seeds: with --episodes 200000, seeds 0 to 19, the policy is Figure 10's and optimal in all nine cells for 20 of 20
+  seeds, with max |Q - Q*| from 0.0035 to 0.0238. After the default 1,000 episodes, with seed 0, it is optimal in 6 of 9
+  cells and max |Q - Q*| = 0.672: a robot that learns slowly enough to tell 0.546 from 0.543 in (4,1) is slow at first.
+  With --learning-rate 1 --learning-rate-exponent 0.7 the same 1,000 episodes give 9 of 9 cells and 0.210.
+- speed: 538,720 steps per second in the learning loop; 38% of that time is the environment's.
+Taxi-v3 as above: max |Q - Q*| = 0.0000, and an optimal action in 400 of 400 states.
+
+The lecture says                        this file does                        why
+--------------------------------------  ------------------------------------  ---------------------------------------
+repeat until Q has converged            --episodes of them                    when it has, nobody can tell from samples
+Equation 34 has no discount             --discount, 1 by default              other environments need one
+α in (0, 1]                             0.7 · N(s,a)^-0.85, N(s,a) visits     a constant α never settles; ω = 0 has one.
+                                                                              Too large an α overshoots in (4,1), where
+                                                                              "down" mostly stays, and forgets slowly
+"some schedule" of ε, per transition    linear in episodes, from 1 to 0.7     the number of steps is not known before;
+                                                                              Q-learning is off-policy, and a greedier
+                                                                              robot hardly ever sees (4,1)
+r + max Q(s',a') for every s'           r alone where the episode terminated  Equation 36: nothing comes after the end
+no word on ties                         broken at random, named in the report the first action would be "left", for ever
+no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
+                                                                              looks ahead, for the world does go on
+1000 interactions (Figure 9)            1,000 episodes                        1,000 transitions are about 30 episodes
 """
 
 import contextlib

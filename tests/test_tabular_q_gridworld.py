@@ -40,16 +40,19 @@ def q_star(world, discount=1.0):
 
 
 class Corridor(gym.Env):
-    """One state, one action, reward 1 a step, and no end: only a time limit stops an episode."""
+    """One state; action a pays a + 1. By default there is no end: only a time limit stops an episode."""
 
-    observation_space, action_space = gym.spaces.Discrete(1), gym.spaces.Discrete(1)
+    observation_space = gym.spaces.Discrete(1)
+
+    def __init__(self, actions=1, terminated=False):
+        self.action_space, self.terminated = gym.spaces.Discrete(actions), terminated
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         return 0, {}
 
     def step(self, action):
-        return 0, 1.0, False, False, {}
+        return 0, action + 1.0, self.terminated, False, {}
 
 
 class TestWorld:
@@ -227,6 +230,11 @@ class TestAlgorithm:
         last = learn(env, episodes=400, discount=0.5, learning_rate=0.5, learning_rate_exponent=0.0)
         assert last.Q[0, 0] == pytest.approx(2, abs=1e-9)
 
+    def test_the_target_is_r_alone_only_where_an_episode_terminates(self):
+        """The last observation may be a state with a row of its own, as in Blackjack-v1."""
+        last = learn(Corridor(terminated=True), episodes=20, learning_rate=1.0, learning_rate_exponent=0.0)
+        assert last.Q[0, 0] == 1.0
+
     def test_ties_are_broken_at_random(self):
         """Without exploration and with nothing learnt yet, each action is tried, and the robot leaves (1,1)."""
         first = []
@@ -239,12 +247,10 @@ class TestAlgorithm:
         assert (np.bincount(first, minlength=4) > 30).all()  # 50 each is expected, 30 is 3.3 standard deviations below
 
     def test_exploration_and_greed_are_epsilons(self):
-        env = Transcript(gym.wrappers.TimeLimit(GridWorld(slip_probability=0.0), 1))  # always the first step, in (1,1)
-        last = learn(env, episodes=4000, discount=0.0, epsilon_initial=0.4, epsilon_final=0.4,
-                     learning_rate=1.0, learning_rate_exponent=0.0)  # fmt: skip
-        assert last.Q[0] == pytest.approx(-0.025)  # every action pays the same: all tie in the end
+        env = Transcript(Corridor(actions=4, terminated=True))
+        learn(env, episodes=4000, epsilon_initial=0.4, epsilon_final=0.4)
         counts = np.bincount([a for _, a, *_ in env.transitions], minlength=4)
-        assert counts / 4000 == pytest.approx(0.25, abs=0.035)
+        assert counts / 4000 == pytest.approx([0.1, 0.1, 0.1, 0.7], abs=0.03)  # 1 - ε + ε/4 for the best, ε/4 else
 
     def test_epsilon_is_annealed_and_then_stays(self):
         args = Args(episodes=101, epsilon_initial=0.9, epsilon_final=0.1, epsilon_annealing=0.5)
@@ -302,7 +308,10 @@ class TestOtherEnvironments:
 
     def test_spaces_that_do_not_start_at_0(self):
         class Shifted(Corridor):
-            observation_space, action_space = gym.spaces.Discrete(2, start=5), gym.spaces.Discrete(3, start=-1)
+            observation_space = gym.spaces.Discrete(2, start=5)
+
+            def __init__(self):
+                self.action_space = gym.spaces.Discrete(3, start=-1)
 
             def reset(self, *, seed=None, options=None):
                 return 5, {}
@@ -316,6 +325,11 @@ class TestOtherEnvironments:
 
     def test_time_limit_flag(self):
         assert script.make_environment(Args(env_id="CliffWalking-v1", max_episode_steps=7)).spec.max_episode_steps == 7
+        for limit, steps in ((7, 7), (0, 1000)):
+            env = script.make_environment(Args(slip_probability=0.0, max_episode_steps=limit))
+            env.reset(seed=0)
+            cuts = [env.step(ACTIONS.index("left"))[3] for _ in range(steps)]
+            assert cuts == [False] * (steps - 1) + [True]
 
 
 class TestCommandLine:

@@ -61,7 +61,8 @@ class TestLinearSystem:
     def test_against_plain_sweeps(self, slip, step_reward, discount):
         directly = ["right" if cell == (2, 1) or cell[1] == 3 else "up" for cell in CELLS]
         world = GridWorld(float(Fraction(slip)), float(Fraction(step_reward)))
-        for policy in [[ACTIONS.index(action) for action in directly], POLICY]:
+        policies = [[ACTIONS.index(action) for action in directly], POLICY]
+        for policy in policies if world.slip_probability else policies[:1]:  # without a slip, (3,2) is never left
             V = linear_system(policy, world, discount)
             assert V[DECIDING] == pytest.approx(plain_values(policy, slip, step_reward, discount), abs=1e-12)
             assert (V[[CELLS.index(cell) for cell in PAID]] == 0).all()
