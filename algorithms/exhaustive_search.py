@@ -201,6 +201,8 @@ def mdp_from_json(model: dict) -> MDP:
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
+    if not all(map(is_number, start.values())):
+        raise ValueError('"start" must be a state, or {state: probability, …}')
     actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
     probabilities, successors, rewards = [], [], []  # the outcomes
     for state in states:

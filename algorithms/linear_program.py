@@ -13,7 +13,9 @@ Run it
 beside it.
 
 Measured
-    The first command prints V* = (11, 1, 4, 0) and the visits 1.3, 2.3 and 1 of the best actions.
+    The first command prints V* = (11, 1, 4, 0) and the visits 1.3, 2.3 and 1 of the best actions. On 1,000 random
+    states with 4 actions and 5 successors the program takes 12.3 s and value iteration 0.018 s
+    (benchmarks/known_mdps.py --sizes 1000 --linear-program, two shared CPU cores): that is why the lecture goes on.
 
 Deviations
     lecture                        this file                                why
@@ -201,6 +203,8 @@ def mdp_from_json(model: dict) -> MDP:
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
+    if not all(map(is_number, start.values())):
+        raise ValueError('"start" must be a state, or {state: probability, …}')
     actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
     probabilities, successors, rewards = [], [], []  # the outcomes
     for state in states:

@@ -12,7 +12,8 @@ Run it
 
 Measured
     The first command prints V(s0) = 111/11 and V(s2) = 41/11 for π³ from the linear system; Algorithm 1 needs 30
-    sweeps to come within 1.6e-13 of it.
+    sweeps to come within 1.6e-13 of it. On 3,000 states with 5 random successors each, BiCGSTAB takes 2.2 ms,
+    against 2.6 s of QuantEcon's sparse factorisation (benchmarks/known_mdps.py, two shared CPU cores).
 
 Deviations
     lecture                      this file                                why
@@ -20,7 +21,7 @@ Deviations
     no discount                  `--discount` γ, 1 if not given           to serve other MDPs
     all V_0 may be initialised   V_0 = 0                                  so do the lecture's tables
     "until V has converged"      no V changes by more than `--tolerance`  floats
-    solve the linear system      BiCGSTAB above 1,000 states              a sparse factorisation fills in
+    solve the linear system      BiCGSTAB above 200 states                a sparse factorisation fills in
     nothing of endless policies  value 0 where all rewards are 0, else    the limit of Algorithm 1 from V_0 = 0; the
                                  an error that names the states           linear system is singular there
 """
@@ -205,6 +206,8 @@ def mdp_from_json(model: dict) -> MDP:
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
+    if not all(map(is_number, start.values())):
+        raise ValueError('"start" must be a state, or {state: probability, …}')
     actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
     probabilities, successors, rewards = [], [], []  # the outcomes
     for state in states:
@@ -414,13 +417,13 @@ def iterative_policy_evaluation(
 def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndarray) -> np.ndarray:
     """V^π (S,) from Equations 2 and 3 as a linear system; P (S, S) and R (S,) are the policy's, V is a first guess.
 
-    A sparse factorisation fills in: at 10^4 states with random successors it takes a minute. So large systems go to
+    A sparse factorisation fills in: at 3,000 states with random successors it takes seconds. So large systems go to
     BiCGSTAB, which needs products with P only, and are factorised only where that does not converge (a long chain).
     """
-    if len(R) > 1000:
+    if len(R) > 200:
         operator = linalg.LinearOperator(P.shape, matvec=lambda x: x - P @ (discount * x), dtype=float)
-        V, failed = linalg.bicgstab(operator, R, x0=V, rtol=1e-13, maxiter=1000)
-        if not failed and np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
+        V, _ = linalg.bicgstab(operator, R, x0=V, rtol=1e-13, maxiter=1000)
+        if np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
             return V
     # V = R + γ P V  Equation 3, that is (I - γ P) V = R
     return np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))

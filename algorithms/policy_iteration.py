@@ -13,7 +13,8 @@ Run it
 Measured
     The first command ends at i = 2 with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1: V(0) =
     0.823529411765 (14/17) after 8 iterations. Taxi-v3 at discount 1 begins with a policy that never ends and
-    finishes with a mean V of 7.93.
+    finishes with a mean V of 7.93. 3,000 random states with 4 actions take 0.046 s, against 13.7 s of QuantEcon
+    (benchmarks/known_mdps.py, two shared CPU cores).
 
 Deviations
     lecture                      this file                                why
@@ -206,6 +207,8 @@ def mdp_from_json(model: dict) -> MDP:
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
+    if not all(map(is_number, start.values())):
+        raise ValueError('"start" must be a state, or {state: probability, …}')
     actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
     probabilities, successors, rewards = [], [], []  # the outcomes
     for state in states:
@@ -451,13 +454,13 @@ def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
 def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndarray) -> np.ndarray:
     """V^π (S,) from Equations 2 and 3 as a linear system; P (S, S) and R (S,) are the policy's, V is a first guess.
 
-    A sparse factorisation fills in: at 10^4 states with random successors it takes a minute. So large systems go to
+    A sparse factorisation fills in: at 3,000 states with random successors it takes seconds. So large systems go to
     BiCGSTAB, which needs products with P only, and are factorised only where that does not converge (a long chain).
     """
-    if len(R) > 1000:
+    if len(R) > 200:
         operator = linalg.LinearOperator(P.shape, matvec=lambda x: x - P @ (discount * x), dtype=float)
-        V, failed = linalg.bicgstab(operator, R, x0=V, rtol=1e-13, maxiter=1000)
-        if not failed and np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
+        V, _ = linalg.bicgstab(operator, R, x0=V, rtol=1e-13, maxiter=1000)
+        if np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
             return V
     # V = R + γ P V  Equation 3, that is (I - γ P) V = R
     return np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))

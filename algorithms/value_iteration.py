@@ -12,7 +12,9 @@ Run it
 
 Measured
     The first command ends after 5 sweeps with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1:
-    V(0) = 0.823529411742 (exactly 14/17) after 994 sweeps.
+    V(0) = 0.823529411742 (exactly 14/17) after 994 sweeps. A sweep over 10^5 random states (20 transitions each)
+    takes as long as QuantEcon's, a whole solve of 3,000 states 0.10 s against 0.17 s (benchmarks/known_mdps.py, two
+    shared CPU cores).
 
 Deviations
     lecture                     this file                                why
@@ -199,6 +201,8 @@ def mdp_from_json(model: dict) -> MDP:
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
+    if not all(map(is_number, start.values())):
+        raise ValueError('"start" must be a state, or {state: probability, …}')
     actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
     probabilities, successors, rewards = [], [], []  # the outcomes
     for state in states:

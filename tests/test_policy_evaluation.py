@@ -200,6 +200,7 @@ BAD_MODELS = [
     (model_text('"start": "s0", ', ""), r'"start"'),
     (model_text('"s0"', '"s9"'), r"unknown start state 's9'"),
     (model_text('"s0"', '{"s0": 0.5}'), r"start states must be at least 0 and sum to 1"),
+    (model_text('"s0"', '{"s0": null}'), r'"start" must be a state'),
     (model_text('"a2"', '"a1"'), r"the key 'a1' occurs twice"),
     (model_text('"s1": {', '"s0": {'), r"the key 's0' occurs twice"),
     (model_text('"terminal"', '"terminals"'), r"unknown key 'terminals'"),
@@ -257,6 +258,16 @@ def test_the_command_line_itself(name, command_line, tmp_path):
     finished = command_line(f"{name}.py")
     assert (finished.returncode, finished.stderr) == (0, "") and "V(s0) = " in finished.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("module", SCRIPTS, ids=lambda module: module.__name__)
+def test_the_smallest_models(module, monkeypatch, capsys, tmp_path):
+    for model in ({"start": "g", "terminal": ["g"], "transitions": {}},
+                  {"start": "s", "transitions": {"s": {"a": [[1, "s", 0]]}}}):  # fmt: skip
+        for discount in (0, 0.5, 1):
+            flags = ["--mdp", written(tmp_path / "mdp.json", model), "--discount", discount]
+            code, out, err = run(module, monkeypatch, capsys, *flags)
+            assert (code, err) == (0, "") and ") = 0\n" in out
 
 
 def test_unreadable_files(monkeypatch, capsys, tmp_path):

@@ -143,6 +143,18 @@ class TestWithoutDiscount:
             np.testing.assert_allclose(attained[~np.isnan(attained)], solution.V[~np.isnan(attained)], atol=1e-8)
 
 
+def test_what_can_be_played_for_ever():
+    transitions = {
+        "a": {"on": [[1, "b", 0]]},  # b may end, and then a is not come back to
+        "b": {"on": [[0.5, "a", 0], [0.5, "goal", 0]], "over": [[1, "c", 0]]},
+        "c": {"stay": [[0.5, "c", 0], [0.5, "d", 0]]},
+        "d": {"back": [[1, "c", 0]], "out": [[1, "goal", 0]]},
+    }
+    mdp = script.mdp_from_json({"start": "a", "terminal": ["goal"], "transitions": transitions})
+    assert script.lasting_rows(mdp, np.arange(6)).tolist() == [3, 4]
+    assert script.lasting_rows(mdp, np.array([0, 1, 3, 5])).tolist() == []
+
+
 def test_rewards_that_cancel_in_a_loop_are_not_answered():
     mdp = script.mdp_from_json(CANCELLING)
     with pytest.raises(ValueError, match=r"not converged after --max-iterations 50 .* in s, t"):
