@@ -1085,6 +1085,7 @@ STUDIES = {
     "ablation": [{"target_network": target, "replay_buffer": replay} for replay in (True, False)
                  for target in (True, False)],
 }
+FULL = f"{Args.environment_train_frames_max:,} frames"  # the label of the lecture's own experiment
 # flags that the tables' rows tell apart, or that cannot change a score; runs that differ in any other are shown apart
 NOT_COMPARED = {
     "initialization", "target_network", "replay_buffer", "env_id", "seed", "environment_train_frames_max",
@@ -1265,6 +1266,11 @@ def five_digits(value: float) -> str:
     return f"{float(f'{value:.5g}'):,.10g}"
 
 
+def others_last(label: str) -> tuple[bool, str]:
+    """Sorts the lecture's own experiment before all others."""
+    return label != FULL, label
+
+
 def human_normalised(game: str, score: float) -> float:
     """0 is random play, 1 is a person."""
     random, human = RANDOM_AND_HUMAN[game]
@@ -1284,7 +1290,6 @@ def table_text(title: str, header: list[str], rows: list[list[str]], markdown: b
 def tables_text(runs: list[MeasuredRun], markdown: bool) -> str:
     """Tables 4, 5 and 6: per arm the mean over its seeds, the lecture's figure in brackets. Runs with other frames or
     hyperparameters stand apart, under their own heading."""
-    full = f"{Args.environment_train_frames_max:,} frames"
     counted, left_out, blocks = {}, [], []  # counted: label -> arm -> seed -> run
     for run in runs:
         if run.test is None or run.test["score_mean"] is None:
@@ -1295,16 +1300,16 @@ def tables_text(runs: list[MeasuredRun], markdown: bool) -> str:
             left_out.append(f"{seeds[run.seed].folder}: the same run as {run.folder}, which is newer")
         seeds[run.seed] = run
 
-    for label in sorted(counted, key=lambda label: (label != full, label)):
+    for label in sorted(counted, key=others_last):
         arms, in_a_table = counted[label], set()
-        heading = (f"{label}, Table 3's hyperparameters: ours (the lecture's)" if label == full else
-                   f"Apart: {label}: ours (the lecture's, of {full} and Table 3's hyperparameters)")
+        heading = (f"{label}, Table 3's hyperparameters: ours (the lecture's)" if label == FULL else
+                   f"Apart: {label}: ours (the lecture's, of {FULL} and Table 3's hyperparameters)")
         blocks.append(f"## {heading}" if markdown else heading)
-        for title, first, rows in layouts(set(arms), complete=label == full):
+        for title, first, rows in layouts(set(arms), complete=label == FULL):
             cells = []
             for arm, names in rows.items():
                 found, lecture = list(arms.get(arm, {}).values()), LECTURE.get(arm)
-                if not found and label != full:
+                if not found and label != FULL:
                     continue
                 row = [*names, str(len(found))]
                 for i, column in enumerate(COLUMNS):
@@ -1334,7 +1339,7 @@ def draw_curves(runs: list[MeasuredRun], path: Path) -> None:
     if there is nothing to draw, OSError if the file cannot be written."""
     panels = []
     drawn = [run for run in runs if run.evaluations]
-    for label in sorted({run.label for run in drawn}):
+    for label in sorted({run.label for run in drawn}, key=others_last):
         for title, _, rows in layouts({run.arm for run in drawn if run.label == label}, complete=False):
             games = [{arm: names} for arm, names in rows.items()] if title.startswith("Table 5") else [rows]
             for arms in games:
