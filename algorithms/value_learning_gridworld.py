@@ -5,11 +5,11 @@
 #   "matplotlib>=3.9",
 # ]
 # ///
-"""Value learning: the value of a fixed policy in GridWorld, without its model (Table 1, "unknown MDP, evaluate π").
+r"""Value learning: the value of a fixed policy in GridWorld, without its model (Table 1, "unknown MDP, evaluate π").
 
-The lecture names value learning in Table 1 and shows no algorithm. It is TD(0): what Q-learning (Algorithm 5, Equation 34)
-is to value iteration, this is to policy evaluation (Algorithm 1, Equation 3): the sum over s' is replaced by
-the one s' that came, and the assignment by a running average,
+The lecture names value learning in Table 1 and shows no algorithm. It is TD(0). What Q-learning (Algorithm 5,
+Equation 34) is to value iteration, this is to policy evaluation (Algorithm 1, Equation 3): the sum over s' is replaced
+by the one s' that came, and the assignment by a running average,
 
     V(s) = (1 - α) V(s) + α (r + γ V(s')).
 
@@ -18,21 +18,21 @@ the learner. World and default rewards are those of tabular_q_gridworld.py, whos
 
     python algorithms/value_learning_gridworld.py                            # the optimal policy, which is Figure 10's
     python algorithms/value_learning_gridworld.py --no-exploring-starts      # V only where episodes from (1,1) go
-    python algorithms/value_learning_gridworld.py --policy "1,1=right 2,1=right 3,1=up 4,1=left 1,2=up 3,2=up 1,3=right
-        2,3=right 3,3=right"                                                 # (on one line) past the -1
+    python algorithms/value_learning_gridworld.py \
+        --policy "1,1=right 2,1=right 3,1=up 4,1=left 1,2=up 3,2=up 1,3=right 2,3=right 3,3=right"    # past the -1
     tensorboard --logdir runs
 
 Measured with the default 20,000 episodes and seed 0: max |V - V^π| = 0.0206 over the nine cells.
 
-The lecture says                        this file does                        why
---------------------------------------  ------------------------------------  ---------------------------------------
-no algorithm                            TD(0)                                 its update is Equation 34 with π for max
-every episode starts in (1,1)           in a random cell, by default          the optimal policy never gets to (4,1):
-                                                                              V there would not be learnt
-no discount                             --discount, 1 by default              as in the other scripts
-no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
-                                                                              looks ahead, for the world does go on
-no word on α                            N(s)^-0.7, N(s) visits of the cell    a constant α never settles; ω = 0 has one
+  The lecture says                        this file does                        why
+  --------------------------------------  ------------------------------------  ---------------------------------------
+  no algorithm                            TD(0)                                 its update is Equation 34 with π for max
+  every episode starts in (1,1)           in a random cell, by default          the optimal policy never gets to (4,1):
+                                                                                V there would not be learnt
+  no discount                             --discount, 1 by default              as in the other scripts
+  no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
+                                                                                looks ahead, for the world does go on
+  no word on α                            N(s)^-0.7, N(s) visits of the cell    a constant α (exponent 0) never settles
 """
 
 import contextlib
@@ -473,6 +473,7 @@ def make_run_dir(runs_dir: Path, env_id: str, script: str, seed: int) -> Path:
 
 
 def main() -> None:
+    """Learn V of a policy, judge it against V^π, report."""
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
