@@ -15,7 +15,8 @@ beside it.
 Measured
     The first command prints V* = (11, 1, 4, 0) and the visits 1.3, 2.3 and 1 of the best actions. On 1,000 random
     states with 4 actions and 5 successors the program takes 12.3 s and value iteration 0.018 s
-    (benchmarks/known_mdps.py --sizes 1000 --linear-program, two shared CPU cores): that is why the lecture goes on.
+    (benchmarks/known_mdps.py --sizes 1000 --linear-program, on two busy CPU cores): that is why the lecture goes
+    on.
 
 Deviations
     lecture                        this file                                why
