@@ -375,7 +375,8 @@ def linear_program(mdp: MDP, discount: float, tolerance: float, max_iterations: 
     lower, upper = np.full(size, -np.inf), np.where(mdp.terminal, 0, np.inf)  # (S,), (S,)
     lower[mdp.terminal] = 0  # V(s) = 0 for s ∈ 𝒢  Equation 2
     lower[mdp.state_of_row[rest]] = 0  # to stay there for ever, with reward 0, is always allowed
-    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10, "maxiter": max_iterations}
+    # HiGHS's own 1e-7 would let it pass over actions that are better by so much in every step.
+    options = {"primal_feasibility_tolerance": 1e-10, "maxiter": max_iterations}
     program = optimize.linprog(
         np.ones(size), (discount * mdp.P[acting] - E).tocsr(), -mdp.R[acting], bounds=np.stack([lower, upper], axis=1),
         method="highs", options=options,
