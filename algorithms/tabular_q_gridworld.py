@@ -42,7 +42,7 @@ Measured on one x86-64 core (Python 3.11, Gymnasium 1.4.0, NumPy 2.4), mostly by
                                                                                 Q-learning is off-policy, and a greedier
                                                                                 robot hardly ever sees (4,1)
   r + max Q(s',a') for every s'           r alone where the episode terminated  Equation 36: nothing comes after the end
-  no word on ties                         broken at random, and named in print   the first action would be "left", for ever
+  no word on ties                         broken at random, and named           the first one is "left", for ever
   no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
                                                                                 looks ahead, for the world does go on
   1000 interactions (Figure 9)            1,000 episodes                        1,000 transitions are about 30 episodes
