@@ -373,18 +373,24 @@ def test_interruption_and_a_full_disk_leave_no_broken_video(copied, quickly, mon
         shutil.rmtree(folder)
         return stopped.value.code
 
-    def interrupted(_):
-        raise KeyboardInterrupt
+    def interrupted(writer):
+        def write(image):
+            raise KeyboardInterrupt
+
+        return SimpleNamespace(isOpened=writer.isOpened, release=writer.release, write=write)
 
     def full(writer):
         frames = itertools.count()
         return SimpleNamespace(isOpened=writer.isOpened, release=writer.release,
                                write=lambda image: next(frames) < 100 and writer.write(image))
 
+    def closed(writer):
+        return SimpleNamespace(isOpened=lambda: False, release=writer.release)
+
     assert run(interrupted) == 130
     assert run(full) == 1
-    assert "201 frames were encoded, 100 arrived" in capsys.readouterr().err
-    assert run(lambda _: SimpleNamespace(isOpened=lambda: False)) == 1
+    assert "of 201 frames 100 reached the disk" in capsys.readouterr().err
+    assert run(closed) == 1
     assert "cannot write" in capsys.readouterr().err
 
 
