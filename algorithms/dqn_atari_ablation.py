@@ -25,8 +25,12 @@ Run it
     python algorithms/dqn_atari_ablation.py --table runs --figure curves.png        # what has been measured so far
 The same --study command goes on where it was cut off. Each command of --list does that too, for its own run.
 
-Measured
-    RESULT
+Measured (2 cores of an AMD EPYC, PyTorch 2.13)
+    python algorithms/dqn_atari_ablation.py --study ablation --environment-train-frames-max 600 \
+        --agent-replay-buffer-initial 200 --agent-update-frequency 4 --environment-evaluation-interval-episodes 4 \
+        --environment-evaluation-episodes 1 --environment-test-frames 600
+    Half a minute an arm, too short to learn anything but what diverges. Mean max Q of the held-out states after 80
+    updates: 0.053 with both parts, 0.091 without replay buffer, 5.8 without target network, 7.2 without either.
 
 Deviations
     lecture or paper                        this file                              why
