@@ -766,6 +766,7 @@ def main(args: Args) -> None:
     except ValueError as error:
         fail(str(error))
 
+    torch.set_num_threads(1)  # one state at a time gains nothing from more, and their number would round Q differently
     exploration, no_ops = (np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(2))
     shape = trained.environment_state_height, trained.environment_state_width
     encode, decode = frame_encoding("raw", *shape, torch.device("cpu"))
