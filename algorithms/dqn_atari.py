@@ -20,15 +20,15 @@ The column of the Nature paper (Figure 18; 50 million frames):
         --optimizer-q-network-parameter-update-interval-frames 10000
 
 Measured
-    Pong, seed 1, two CPU cores shared with other work, one thread, PyTorch 2.13, stopped after 56 minutes, 187,588 frames
-    and 88,795 updates:
+    Pong, seed 1, one thread on two CPU cores shared with other work, PyTorch 2.13, stopped after 56 minutes, 187,588
+    frames and 88,795 updates:
         python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 400000 \\
             --agent-update-frequency 2 --agent-discount-factor 0.98 --agent-epsilon-greedy-epsilon-final 0.02 \\
             --agent-epsilon-greedy-annealing 50000 --agent-replay-buffer-initial 10000 \\
             --agent-replay-buffer-maximum-length 400000 --environment-evaluation-interval-episodes 50 \\
             --environment-checkpoint-interval-episodes 50
-    Evaluations: -20.8 at frame 45,292 and -17.0 at frame 132,081, ten games each; the mean of the last 20 training games
-    was -16.3. It had begun to learn; Table 5's 19.1 after ten million frames has not been tried.
+    Evaluations: -20.8 at frame 45,292 and -17.0 at frame 132,081, ten games each; the mean of the last 20 training
+    games was -16.15. It had begun to learn; Table 5's 19.1 after ten million frames has not been tried.
 
 Deviations
     lecture or paper                        this file                              why
