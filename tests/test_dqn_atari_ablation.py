@@ -331,11 +331,13 @@ def test_a_study_skips_what_is_finished_and_resumes_what_was_cut_off(study, tmp_
     assert sorted((tmp_path / "runs").glob("*/*")) == runs
     assert all(read_json(run_dir / "test.json")["frames"] == 30 for run_dir in runs)
 
-    # Tables 4 and 6 share the arm with everything on; more frames train the same runs on
+    # Tables 4 and 6 share the arm with everything on; more frames train the same runs on; other flags are other runs
     code, lines, commands = study("--study", "initialization", *TINY)
     assert (code, len(commands)) == (0, 2) and len(list((tmp_path / "runs").glob("*/*"))) == 6
     code, lines, commands = study("--study", "ablation", "--environment-train-frames-max", "40", *TINY[2:])
     assert (code, len(commands)) == (0, 4) and len(list((tmp_path / "runs").glob("*/*"))) == 6
+    code, lines, commands = study("--study", "initialization", "--optimizer-learning-rate", "0.001", *TINY)
+    assert (code, len(commands)) == (0, 3) and len(list((tmp_path / "runs").glob("*/*"))) == 9
 
 
 @posix
@@ -468,7 +470,7 @@ def test_other_experiments_stand_apart_with_their_label(table, tmp_path):
 
 
 def test_a_run_that_was_raised_and_not_finished_counts_for_the_frames_of_its_test(table, tmp_path):
-    run_dir = write_run(tmp_path / "runs", score=5.0, frames=1000)
+    run_dir = write_run(tmp_path / "runs", score=5.0, frames=1000, script="dqn_atari")
     args = read_json(run_dir / "args.json") | {"environment_train_frames_max": 10_000_000}
     (run_dir / "args.json").write_text(json.dumps(args))
     assert list(sections(table())) == [
