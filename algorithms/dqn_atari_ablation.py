@@ -50,6 +50,10 @@ Deviations
                                             that have it (--precision)             head, Adam and acting stay 32-bit
     raw frames, shared by reference         LZ4-compressed frames, by reference    0.3 to 1.4 GB instead of 11 GB
     [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
+    [8] released: θ⁻ copied every 10,000    Figure 18's 10,000 updates, 40,000     the lecture's table counts updates
+    frames, area-averaged screens, ties     frames; bilinear screens; the first    §7.2.1 says bilinear; float ties
+    broken at random, lives looked at       of tied actions; lives looked at       are rare; one transformation, one
+    every emulator frame                    every frame                            wrapper
     no replay: not described                minibatch = the last transitions       Table 6 needs a rule; this one
                                                                                    changes the memory, nothing else
     mean max Q: not reported                of 500 held-out states, at every       it shows what diverges without a
@@ -163,7 +167,7 @@ class Args:
     optimizer_minibatch_size: int = 32
     """Transitions in a minibatch ℬ [Table 3]."""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
-    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 in the paper]."""
+    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 updates = 40,000 frames in the paper]."""
     optimizer_learning_rate: float = 0.0001
     """Learning rate [Table 3; 0.00025 in the paper]."""
 
@@ -1381,6 +1385,8 @@ def draw_curves(runs: list[MeasuredRun], path: Path) -> None:
         for panel, name in ((scores, "score (dashed: the lecture's test)"), (values, "mean max Q, held-out states")):
             panel.set(xlabel="frames", ylabel=name)
             panel.set_title(title, fontsize="small")
+        if values.dataLim.y1 > 100:  # what diverges goes through decades, and would hide all else
+            values.set_yscale("symlog")
         scores.legend(fontsize="small")
     figure.savefig(path, dpi=120)
 
@@ -1623,6 +1629,7 @@ def main(args: Args) -> None:
         print(f"stopped at frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
         raise SystemExit(128 + stop.signum)
 
+    count_seconds()
     result = evaluation_row(counters, finished) | {"held_out_max_q_mean": mean_max_q(q_network, states)}
     modules = (torch, np, gym, ale_py, cv2)
     attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
