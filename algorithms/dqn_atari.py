@@ -1,8 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.11", "filelock", "gymnasium>=1.0", "lz4", "numpy>=1.26", "opencv-python-headless", "psutil",
-#     "tensorboard", "torch>=2.6", "tqdm", "tyro>=0.9",
+#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless", "psutil",
+#     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
 """Deep Q-Learning on Atari games: Algorithm 6 of the lecture (ECE 544NA, Lecture 27, §5.3 and §7), the method of
@@ -17,7 +17,7 @@ The column of the Nature paper (Figure 18; 50 million frames):
     python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 50000000 \\
         --optimizer-name RMSprop --optimizer-learning-rate 0.00025 --agent-update-frequency 4 \\
         --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \\
-        --optimizer-q-network-parameter-update-interval-frames 10000
+        --optimizer-q-network-parameter-update-interval-frames 40000
 
 Measured
     Pong, seed 1, one thread on two CPU cores shared with other work, PyTorch 2.13, stopped after 56 minutes, 187,588
@@ -48,6 +48,10 @@ Deviations
                                             that have it (--precision)             head, Adam and acting stay 32-bit
     raw frames, shared by reference         LZ4-compressed frames, by reference    0.3 to 1.4 GB instead of 11 GB
     [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
+    [8] released: θ⁻ copied every 10,000    Figure 18's 10,000 updates, 40,000     the lecture's table counts updates
+    frames, area-averaged screens, ties     frames; bilinear screens; the first    §7.2.1 says bilinear; float ties
+    broken at random, lives looked at       of tied actions; lives looked at       are rare; one transformation, one
+    every emulator frame                    every frame                            wrapper
 """
 
 from __future__ import annotations
@@ -147,7 +151,7 @@ class Args:
     optimizer_minibatch_size: int = 32
     """Transitions in a minibatch ℬ [Table 3]."""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
-    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 in the paper]."""
+    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 updates = 40,000 frames in the paper]."""
     optimizer_learning_rate: float = 0.0001
     """Learning rate [Table 3; 0.00025 in the paper]."""
 
@@ -211,9 +215,9 @@ def check_args(args: Args) -> None:
         elif name in ("environment_state_height", "environment_state_width"):
             good, demand = value >= 36, "be at least 36, which three strided convolutions need"
         elif name in ("seed", "environment_no_op_max"):
-            good, demand = value >= 0, "be at least 0"
+            good, demand = 0 <= value < 2**63, "be at least 0 and below 2^63"
         else:
-            good, demand = 0 < value < math.inf, "be above 0"
+            good, demand = 0 < value < math.inf, "be above 0 and finite"
         if not good:
             raise ValueError(f"{flag(name)} must {demand}, not {value}")
     for small, large in (("optimizer_minibatch_size", "agent_replay_buffer_initial"),
@@ -243,6 +247,8 @@ class JoystickActions(gym.ActionWrapper):
         minimal = env.unwrapped.get_action_meanings()
         self.meanings = [name for name in minimal if name in ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")]
         self.indices = [minimal.index(name) for name in self.meanings]
+        if len(self.meanings) < 2:
+            raise ValueError(f"{env.unwrapped.spec.id} cannot be played with four directions and FIRE when centred")
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
     def action(self, action: int) -> int:
@@ -250,16 +256,18 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1)."""
+    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1); with none in
+    the few games that have no NOOP."""
 
-    def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
+    def __init__(self, env: JoystickActions, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
-        self.no_op_max, self.rng = no_op_max, rng
+        self.no_op = env.meanings.index("NOOP") if "NOOP" in env.meanings else None
+        self.no_op_max, self.rng = no_op_max if self.no_op is not None else 0, rng
 
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, terminated, truncated, info = self.env.step(0)
+            screen, _, terminated, truncated, info = self.env.step(self.no_op)
             if terminated or truncated:
                 screen, info = self.env.reset()
         return screen, info
@@ -554,7 +562,8 @@ def epsilon_at(frame: int, args: Args) -> float:
 @torch.inference_mode()
 def greedy_action(q_network: QNetwork, state: torch.Tensor) -> int:
     """π(s) = argmax_a Q(s, a; θ) (Equation 35) of one state (4, 84, 84) uint8."""
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # an accelerator is waited for here, and nowhere else
+    # an accelerator is waited for here, and when a point of the curves is logged
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
 
 
 def update(q_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer, minibatch: tuple,
@@ -595,7 +604,7 @@ def diagnose(q_network: QNetwork, states: torch.Tensor) -> dict[str, float]:
         if isinstance(layer, nn.ReLU):
             alive = (x > 0).transpose(0, 1).flatten(1).any(dim=1)  # (units,)
             scalars[f"diagnostics/dead_units_{name.removesuffix('_relu')}"] = 1 - alive.float().mean().item()
-    scalars["diagnostics/q_spread"] = q_network.head(x).std(dim=0).mean().item()
+    scalars["diagnostics/q_spread"] = q_network.head(x).std(dim=0, correction=0).mean().item()
     return scalars
 
 
@@ -608,7 +617,7 @@ def evaluate(args: Args, q_network: QNetwork, encoding: tuple, number: int, stop
     game does not count. It depends on the network, the seed and its own `number` alone. Returns (score, length in
     frames) per game, or None if it was stopped."""
     encode, decode = encoding
-    exploration, no_ops = (np.random.default_rng(s) for s in np.random.SeedSequence([args.seed, number]).spawn(2))
+    exploration, no_ops = (np.random.default_rng(s) for s in np.random.SeedSequence([args.seed, number + 1]).spawn(2))
     env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=False)
     finished, score, length = [], 0.0, 0
     state, _ = env.reset(seed=args.seed + number)
@@ -674,7 +683,8 @@ class Stop:
 
     def __call__(self, signum: int, _frame) -> None:
         self.signum = signum
-        signal.signal(signum, signal.SIG_DFL)
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signum, signal.SIG_DFL)
 
 
 def bar_style() -> dict:
@@ -698,12 +708,17 @@ class Curves:
 
     def __init__(self, run_dir: Path, first_frame: int):
         # what a killed process logged after its last checkpoint is logged again: purge_step hides the first copy
-        self.run_dir, self.writer = run_dir, SummaryWriter(run_dir, purge_step=first_frame or None)
+        self.run_dir, self.purge_step, self.writer = run_dir, first_frame or None, None
 
     def write(self, add) -> None:
         """Call add(writer); after a failure the next call begins a new event file."""
-        self.writer = self.writer or SummaryWriter(self.run_dir)
-        if not attempt("a point of the curves", lambda: add(self.writer)):
+
+        def open_and_add() -> None:
+            self.writer = self.writer or SummaryWriter(self.run_dir, purge_step=self.purge_step)
+            self.purge_step = None
+            add(self.writer)
+
+        if not attempt("a point of the curves", open_and_add):
             self.writer = None
 
     def add(self, scalars: dict[str, float], frame: int) -> None:
@@ -882,7 +897,7 @@ def resumed_args(args_class: type[Flags], run_dir: Path) -> Flags:
     try:
         saved = args_class(**json.loads((run_dir / "args.json").read_text()))
         given = dataclasses.replace(tyro.cli(args_class, default=saved), resume="")
-    except (OSError, ValueError, TypeError) as error:
+    except Exception as error:  # edited by hand it can hold anything
         raise ValueError(f"{run_dir / 'args.json'} is no record of this script's flags: {error}") from None
     for name, value in vars(given).items():
         own = getattr(saved, name)
@@ -980,7 +995,9 @@ def main(args: Args) -> None:
     except ValueError as error:
         fail(str(error))
     counters = Counters(**saved["counters"]) if saved else Counters()
-    if (run_dir / "test.json").exists() and counters.frames >= args.environment_train_frames_max:
+    test = run_dir / "test.json"
+    tested = json.loads(test.read_text())["frames"] if test.exists() else None
+    if tested == counters.frames >= args.environment_train_frames_max:
         print(f"{run_dir} has finished its {counters.frames:,} frames; --environment-train-frames-max trains on")
         return
 
@@ -1013,7 +1030,10 @@ def main(args: Args) -> None:
         del saved, blobs
     else:
         state, _ = env.reset(seed=args.seed)
-    write_json(run_dir / "args.json", vars(args))
+    try:
+        write_json(run_dir / "args.json", vars(args))
+    except OSError as error:
+        fail(f"the run directory {run_dir} cannot be written: {error.strerror or error}")
 
     print(f"game     {args.env_id}: {len(actions)} actions, {' '.join(actions)}\n"
           f"device   {device}, {torch.get_num_threads()} threads; updates in {str(precision).removeprefix('torch.')}\n"
@@ -1021,6 +1041,11 @@ def main(args: Args) -> None:
           f"replay   {replay.capacity:,} transitions as {encoding_name}: about {gigabytes(replay_bytes)} when full, "
           f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free\n"
           f"run      {run_dir}" + (f", resumed at frame {counters.frames:,}" if resumed else ""), flush=True)
+
+    if args.agent_replay_buffer_initial > args.environment_train_frames_max:
+        print(f"note     learning starts at frame {args.agent_replay_buffer_initial:,}, this run ends at "
+              f"{args.environment_train_frames_max:,}: it learns nothing; lower --agent-replay-buffer-initial",
+              flush=True)
 
     curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
     curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
@@ -1032,18 +1057,20 @@ def main(args: Args) -> None:
         """A NaN never leaves the weights again: end the run before one reaches a checkpoint."""
         if loss is not None and not all(tensor.isfinite().all() for tensor in (loss, *q_network.parameters())):
             bar.close()
+            last = run_dir / "checkpoint.pt"
             print(f"error: the loss or a weight is not finite at frame {counters.frames:,}; the last checkpoint is "
-                  f"{run_dir / 'checkpoint.pt'}; lower --optimizer-learning-rate", file=sys.stderr)
+                  f"{last if last.exists() else 'not yet written'}; lower --optimizer-learning-rate", file=sys.stderr)
             raise SystemExit(1)
 
     def count_seconds() -> None:
         nonlocal clock
         counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
 
-    def checkpoint() -> None:
+    def checkpoint() -> bool:
         """Write q_network.pt, all that is needed to play, and checkpoint.pt, all that is needed to go on."""
         stop_if_not_finite()
         count_seconds()
+        counters.peak_memory = max(counters.peak_memory, process.memory_info().rss)
         curves.flush()
         common = {"args": vars(args), "q_network": q_network.state_dict()}
         weights = common | {"format": Q_NETWORK_FORMAT, "actions": actions, "frames": counters.frames}
@@ -1052,7 +1079,7 @@ def main(args: Args) -> None:
             "counters": dataclasses.asdict(counters), "environment": environment_state(env),
             "generators": [generator.bit_generator.state for generator in generators]}
         attempt("q_network.pt", lambda: write_atomically(run_dir / "q_network.pt", lambda f: save_tensors(weights, f)))
-        attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
+        return attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
                **bar_style())
@@ -1142,14 +1169,18 @@ def main(args: Args) -> None:
                                 f"ε {epsilon:.3f}, score {score}", refresh=False)
 
     bar.close()
-    checkpoint()
+    saved_at_the_end = checkpoint()
     if not stop.signum:
         finished = evaluate(args, q_network, encoding, 0, stop, frames=args.environment_test_frames)
     curves.flush()
+    if stop.signum and not saved_at_the_end:
+        print(f"error: stopped at frame {counters.frames:,}, which {run_dir} could not keep", file=sys.stderr)
+        raise SystemExit(1)
     if stop.signum:
         print(f"stopped at frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
         raise SystemExit(128 + stop.signum)
 
+    count_seconds()
     result = evaluation_row(counters, finished)
     modules = (torch, np, gym, ale_py, cv2)
     attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
@@ -1159,10 +1190,12 @@ def main(args: Args) -> None:
         "peak_memory_bytes": counters.peak_memory}))
     if not finished:
         print(f"no game ended within --environment-test-frames {args.environment_test_frames:,}")
-        return
-    print(f"{'Game':<28}{'Episode Score Mean':>20}{'Variance':>12}{'Episode Length Mean':>21}{'Variance':>12}"
+    else:
+        print(f"{'Game':<28}{'Episode Score Mean':>20}{'Variance':>12}{'Episode Length Mean':>21}{'Variance':>12}"
           f"{'Games':>7}\n{args.env_id:<28}{result['score_mean']:>20.5g}{result['score_variance']:>12.5g}"
           f"{result['length_mean']:>21.5g}{result['length_variance']:>12.5g}{len(finished):>7}")
+    if not saved_at_the_end:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.11", "gymnasium>=1.0", "lz4", "matplotlib>=3.9", "numpy>=1.26", "opencv-python-headless", "torch>=2.6",
-#     "tqdm", "tyro>=0.9",
+#     "ale-py>=0.12", "gymnasium>=1.1", "lz4", "matplotlib>=3.9", "numpy>=1.26", "opencv-python-headless",
+#     "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
 """Watch a trained agent think: a video, and the pictures of §7.4 of the lecture (ECE 544NA, Lecture 27; Figures 20 to
@@ -166,6 +166,8 @@ class JoystickActions(gym.ActionWrapper):
         minimal = env.unwrapped.get_action_meanings()
         self.meanings = [name for name in minimal if name in ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")]
         self.indices = [minimal.index(name) for name in self.meanings]
+        if len(self.meanings) < 2:
+            raise ValueError(f"{env.unwrapped.spec.id} cannot be played with four directions and FIRE when centred")
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
     def action(self, action: int) -> int:
@@ -173,16 +175,18 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1)."""
+    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1); with none in
+    the few games that have no NOOP."""
 
-    def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
+    def __init__(self, env: JoystickActions, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
-        self.no_op_max, self.rng = no_op_max, rng
+        self.no_op = env.meanings.index("NOOP") if "NOOP" in env.meanings else None
+        self.no_op_max, self.rng = no_op_max if self.no_op is not None else 0, rng
 
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, terminated, truncated, info = self.env.step(0)
+            screen, _, terminated, truncated, info = self.env.step(self.no_op)
             if terminated or truncated:
                 screen, info = self.env.reset()
         return screen, info

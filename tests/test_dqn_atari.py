@@ -106,7 +106,7 @@ def environment(training: bool, env_id: str = BREAKOUT, encoding: str = "lz4", c
 def test_a_short_run_leaves_every_file(command_line, tmp_path, env_id):
     done = command_line("dqn_atari.py", "--env-id", env_id, "--environment-train-frames-max", 1100,
                         "--agent-replay-buffer-initial", 1000, "--agent-update-frequency", 4,
-                        "--environment-test-frames", 1000,
+                        "--environment-test-frames", 1600,
                         "--environment-evaluation-interval-episodes", 1, "--environment-evaluation-episodes", 1,
                         "--agent-epsilon-greedy-epsilon-evaluation", 1)
     assert done.returncode == 0, done.stderr
@@ -121,7 +121,7 @@ def test_a_short_run_leaves_every_file(command_line, tmp_path, env_id):
     test = json.loads((run_dir / "test.json").read_text())
     assert test.keys() >= {*rows[0], "scores", "lengths", "seed", "env_id", "versions", "device", "peak_memory_bytes"}
     assert (test["frames"], test["updates"]) == (1100, 26)  # frames 1000, 1004, …, 1100
-    assert sum(test["lengths"]) <= 1000
+    assert sum(test["lengths"]) <= 1600
     assert test["score_mean"] == pytest.approx(sum(test["scores"]) / len(test["scores"]))
     assert test["length_variance"] == pytest.approx(
         sum(n * n for n in test["lengths"]) / len(test["lengths"]) - test["length_mean"] ** 2)
@@ -241,6 +241,18 @@ def test_actions_are_four_directions_and_fire_when_centred():
     joystick = dqn.wrapper(env, dqn.JoystickActions)
     assert joystick.meanings == ["NOOP", "FIRE", "RIGHT", "LEFT", "DOWN"]
     assert [env.unwrapped.get_action_meanings()[joystick.action(i)] for i in range(5)] == joystick.meanings
+
+
+def test_games_without_noop_or_without_directions():
+    env, _, _ = environment(False, "ALE/Backgammon-v5")  # its actions are FIRE, RIGHT, LEFT
+    bare = dqn.make_emulator("ALE/Backgammon-v5")
+    frame_numbers = []
+    for game in (env, bare):
+        game.reset(seed=1)
+        frame_numbers.append(game.unwrapped.ale.getEpisodeFrameNumber())
+    assert frame_numbers[0] == frame_numbers[1]  # nothing was pressed
+    with pytest.raises(ValueError, match="ALE/VideoCheckers-v5 cannot be played"):
+        environment(False, "ALE/VideoCheckers-v5")
 
 
 def test_a_lost_life_neither_resets_nor_steps_the_game():
@@ -455,6 +467,18 @@ def evaluate(number: int, seed: int = 1, **limit) -> list[tuple[float, int]]:
     return dqn.evaluate(args, dqn.QNetwork(4, 84, 84, 4), dqn.frame_encoding("lz4", 84, 84, CPU), number, stop, **limit)
 
 
+def test_every_purpose_has_random_numbers_of_its_own(train, monkeypatch):
+    streams, make = [], np.random.default_rng
+
+    def remember(seed):
+        streams.append(tuple(make(seed).integers(2**60, size=4)))
+        return make(seed)
+
+    monkeypatch.setattr(dqn.np.random, "default_rng", remember)
+    train(environment_evaluation_interval_episodes=4, environment_evaluation_episodes=1)
+    assert len(streams) >= 8 and len(set(streams)) == len(streams)  # training, the memory's estimate, evaluations, test
+
+
 def test_evaluation_plays_whole_games_for_raw_reward():
     games = evaluate(1, games=2)
     assert len(games) == 2
@@ -492,7 +516,7 @@ def test_dead_units_and_spread_are_counted():
     scalars = dqn.diagnose(network, states)
     assert scalars["diagnostics/dead_units_conv2"] >= 16 / 64
     assert scalars["diagnostics/dead_units_conv1"] < 0.5
-    assert scalars["diagnostics/q_spread"] == pytest.approx(network(states).std(dim=0).mean().item())
+    assert scalars["diagnostics/q_spread"] == pytest.approx(network(states).std(dim=0, correction=0).mean().item())
 
 
 def test_a_nan_stops_the_run_and_names_frame_and_checkpoint(train, monkeypatch, capsys, tmp_path):

@@ -254,7 +254,7 @@ def test_a_full_disk_loses_nothing_and_training_goes_on(tmp_path):
     before = (run_dir / "checkpoint.pt").read_bytes()
     _, status = os.waitpid(in_a_child(folder, limit=10_000_000, resume=run_dir), 0)
     log = (tmp_path / "child.log").read_text()
-    assert os.WEXITSTATUS(status) == 0, log
+    assert os.WEXITSTATUS(status) == 1, log  # the last frames could not be kept, and that is said
     assert log.count("warning: checkpoint.pt could not be written (File too large); training goes on") > 1
     assert (run_dir / "checkpoint.pt").read_bytes() == before
     assert (run_dir / "test.json").exists() and not list(run_dir.glob("*.tmp"))
@@ -264,15 +264,20 @@ def test_a_full_disk_loses_nothing_and_training_goes_on(tmp_path):
 
 
 def test_curves_that_cannot_be_written_do_not_end_the_run(tmp_path, capsys, monkeypatch):
+    line = "warning: a point of the curves could not be written (No space left on device); training goes on\n"
     curves = dqn.Curves(tmp_path, 0)
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(28, "No space left on device")
 
+    with monkeypatch.context() as full:
+        full.setattr(dqn, "SummaryWriter", refuse)  # it writes when it is made
+        curves.add({"charts/epsilon": 1.0}, 1)
+        assert capsys.readouterr().err == line
+    curves.flush()
     monkeypatch.setattr(curves.writer, "add_scalar", refuse)
     curves.add({"charts/epsilon": 1.0}, 1)
-    assert capsys.readouterr().err == (
-        "warning: a point of the curves could not be written (No space left on device); training goes on\n")
+    assert capsys.readouterr().err == line
     curves.add({"charts/epsilon": 0.5}, 2)
     curves.flush()
     events = EventAccumulator(str(tmp_path)).Reload()
@@ -351,6 +356,14 @@ def test_a_finished_run_says_so(tmp_path, capsys):
     assert run(tmp_path, resume=run_dir)[0] == 0
     assert "has finished its 160 frames" in capsys.readouterr().out
     assert {path.name: path.read_bytes() for path in run_dir.iterdir()} == before
+
+
+def test_a_test_cut_off_after_training_on_is_done(tmp_path):
+    _, run_dir = run(tmp_path, environment_train_frames_max=160)
+    assert run(tmp_path, resume=run_dir, environment_train_frames_max=200, before_frame=stop_at(200))[0] == 143
+    assert json.loads((run_dir / "test.json").read_text())["frames"] == 160
+    assert run(tmp_path, resume=run_dir)[0] == 0
+    assert json.loads((run_dir / "test.json").read_text())["frames"] == 200
 
 
 def test_two_processes_cannot_write_one_run(copy, capsys):
