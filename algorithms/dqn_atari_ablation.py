@@ -46,8 +46,8 @@ Deviations
     [8]: a state begins with empty frames   a state begins with copies of the      one rule for acting and replay; no
                                             episode's first frame                  frame that was never on the screen
     [8]: 1 to 30 no-ops                     0 to 30 no-ops, in emulator frames     §7.2.1: "maximum number"
-    32-bit arithmetic                       bfloat16 inside an update, on CPUs     twice as fast; master weights, the
-                                            that have it (--precision)             head, Adam and acting stay 32-bit
+    32-bit arithmetic                       bfloat16 while training, on CPUs       twice as fast; the weights θ, the
+                                            that have it (--precision)             head, Adam, evaluation: 32-bit
     raw frames, shared by reference         LZ4-compressed frames, by reference    0.3 to 1.4 GB instead of 11 GB
     [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
     [8] released: θ⁻ copied every 10,000    Figure 18's 10,000 updates, 40,000     the lecture's table counts updates
@@ -70,6 +70,7 @@ import csv
 import dataclasses
 import difflib
 import functools
+import inspect
 import io
 import itertools
 import json
@@ -101,18 +102,16 @@ import torch.nn.functional as F
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
-from torch.func import functional_call
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 Flags = TypeVar("Flags")
 
-LOG_INTERVAL = 500  # frames between two points of a curve
+LOG_INTERVAL = 500  # frames between two points of a curve, rounded up to a frame that has an update
 CHECKPOINT_FORMAT = "dqn_atari checkpoint 1"
 Q_NETWORK_FORMAT = "dqn_atari q_network 1"
 HELD_OUT_STATES = 500
 HELD_OUT_INTERVAL = 10  # frames of random play from one held-out state to the next
-
 
 
 # ---- Args ------------------------------------------------------------------------------------------
@@ -197,7 +196,7 @@ class Args:
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Where the network lives; auto takes an accelerator if PyTorch sees one."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Arithmetic inside an update; auto takes bfloat16 on a CPU that multiplies it, float32 elsewhere."""
+    """Arithmetic while training; auto takes bfloat16 on a CPU that multiplies it, float32 elsewhere."""
     environment_test_frames: int = 135_000
     """Frames of the final test, in which only finished games count [§7.3.3]."""
     optimizer_gradient_momentum: float = 0.95
@@ -226,10 +225,12 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=__doc__)
+            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
     except SystemExit as stop:
         if stop.code != 2:
             raise
@@ -550,6 +551,14 @@ def most_recent(replay: ReplayMemory, size: int) -> np.ndarray:
 # ---- network ---------------------------------------------------------------------------------------
 
 
+class PixelConv2d(nn.Conv2d):
+    """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
+    and less work."""
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return F.conv2d(pixels, self.weight / 255, self.bias, self.stride)
+
+
 class QNetwork(nn.Module):
     """Table 2: (B, 4, 84, 84) uint8 states to (B, num_actions) float32 values Q(s, ·; θ)."""
 
@@ -558,17 +567,17 @@ class QNetwork(nn.Module):
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(OrderedDict(
-            conv1=nn.Conv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
-            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),              # (B, 64, 9, 9)
-            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),              # (B, 64, 7, 7)
-            flatten=nn.Flatten(),                                                                # (B, 3136)
-            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                   # (B, 512)
+            conv1=PixelConv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
+            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),                # (B, 64, 9, 9)
+            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),                # (B, 64, 7, 7)
+            flatten=nn.Flatten(),                                                                  # (B, 3136)
+            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                     # (B, 512)
         ))
-        self.head = nn.Linear(512, num_actions)                                                  # (B, num_actions)
+        self.head = nn.Linear(512, num_actions)                                                    # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        x = states.to(self.layers.conv1.weight.dtype) / 255           # (B, 4, 84, 84) in [0, 1]
-        return self.head(self.layers(x).to(self.head.weight.dtype))   # (B, num_actions) float32
+        x = self.layers(states.to(self.layers.conv1.weight.dtype))    # (B, 512)
+        return self.head(x.to(self.head.weight.dtype))                # (B, num_actions) float32
 
 
 def initialize_orthogonal(q_network: QNetwork) -> None:
@@ -583,6 +592,16 @@ def initialize_he(q_network: QNetwork) -> None:
     for layer in q_network.layers:
         if isinstance(layer, nn.Conv2d):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+
+
+def working_copy(q_network: QNetwork, precision: torch.dtype) -> QNetwork:
+    """The network that acts and learns while training: `q_network` itself, or its copy with layers of lower precision.
+    The head stays float32: Q keeps more than bfloat16's three digits."""
+    if precision == torch.float32:
+        return q_network
+    working_network = copy.deepcopy(q_network)
+    working_network.layers.to(precision)
+    return working_network
 
 
 # ---- algorithm: deep Q-learning --------------------------------------------------------------------
@@ -632,10 +651,11 @@ def greedy_action(q_network: QNetwork, state: torch.Tensor) -> int:
     return q_network(state.unsqueeze(0)).argmax(dim=1).item()
 
 
-def update(q_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer, minibatch: tuple,
-           discount: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """One optimization iteration (Algorithm 6, lines 19-22), in the precision of the target network's layers. Returns
-    the minibatch's mean Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
+def update(q_network: QNetwork, working_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer,
+           minibatch: tuple, discount: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """One optimization iteration (Algorithm 6, lines 19-22). The optimizer moves θ, the float32 weights of `q_network`;
+    the arithmetic is done by its copy `working_network`, in lower precision or the same network. Returns the
+    minibatch's mean Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
     s, a, r, s_next, terminal = minibatch
 
     # y_j = r_j                                      if s_{j+1} is terminal
@@ -643,18 +663,24 @@ def update(q_network: QNetwork, target_network: QNetwork, optimizer: torch.optim
     with torch.no_grad():
         y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
-    # Q(s_j, a_j; θ). θ is float32; its cast to the target network's type is part of the graph, so its gradient is too
-    types = {name: parameter.dtype for name, parameter in target_network.named_parameters()}
-    θ = {name: parameter.to(types[name]) for name, parameter in q_network.named_parameters()}
-    q = functional_call(q_network, θ, (s,)).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
+    # Q(s_j, a_j; θ)
+    q = working_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1].
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the mean of the minibatch.
     assert q.shape == y.shape == r.shape
     loss = F.huber_loss(q, y, reduction="sum")  # ()
-    optimizer.zero_grad()
+    working_network.zero_grad()
     loss.backward()
+
+    # The gradient moves θ in float32, where a small step is not rounded away; then θ is cast anew.
+    pairs = list(zip(q_network.parameters(), working_network.parameters(), strict=True))
+    for θ, working in pairs:
+        θ.grad = working.grad.float()
     optimizer.step()
+    with torch.no_grad():
+        for θ, working in pairs:
+            working.copy_(θ)
     return loss.detach() / len(r), q.detach()
 
 
@@ -664,7 +690,7 @@ def diagnose(q_network: QNetwork, states: torch.Tensor) -> dict[str, float]:
     that are 0 in every state, and the standard deviation of Q over the states, mean over actions. If a whole layer is
     dead, Q is the same in every state and no gradient passes: nothing will ever be learnt."""
     scalars = {}
-    x = states.float() / 255
+    x = states.float()  # (B, 4, 84, 84)
     for name, layer in q_network.layers.named_children():
         x = layer(x)  # (B, units, …)
         if isinstance(layer, nn.ReLU):
@@ -1456,9 +1482,9 @@ def main(args: Args) -> None:
         initialize_he(q_network)
     q_network.to(device)
     optimizer = make_optimizer(args, q_network)
+    working_network = working_copy(q_network, precision)
     # 4  θ⁻ = θ
-    target_network = copy.deepcopy(q_network).requires_grad_(False)
-    target_network.layers.to(precision)  # the head stays float32: Q keeps more than bfloat16's three digits
+    target_network = copy.deepcopy(working_network).requires_grad_(False)
 
     if saved:
         learnt = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
@@ -1467,6 +1493,7 @@ def main(args: Args) -> None:
             state = restore_run(saved, list(codes), replay, env, generators, learnt)
         except ValueError as error:
             fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
+        working_network.load_state_dict(q_network.state_dict())
         del saved, blobs
     else:
         state, _ = env.reset(seed=args.seed)
@@ -1481,7 +1508,7 @@ def main(args: Args) -> None:
 
     print(f"arm      {arm_folder(args)}\n"
           f"game     {args.env_id}: {len(actions)} actions, {' '.join(actions)}\n"
-          f"device   {device}, {torch.get_num_threads()} threads; updates in {str(precision).removeprefix('torch.')}\n"
+          f"device   {device}, {torch.get_num_threads()} threads; training in {str(precision).removeprefix('torch.')}\n"
           f"network  {sum(parameter.numel() for parameter in q_network.parameters()):,} parameters\n"
           f"replay   {replay.capacity:,} transitions as {encoding_name}: about {gigabytes(replay_bytes)} when full, "
           f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free\n"
@@ -1495,6 +1522,7 @@ def main(args: Args) -> None:
     curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
     curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
     process, dead, loss = psutil.Process(), set(), None
+    log_interval = math.ceil(LOG_INTERVAL / args.agent_update_frequency) * args.agent_update_frequency  # of updates too
     clock = checkpoint_time = window_time = time.monotonic()
     window = dataclasses.replace(counters)  # the counters when `window_time` began
 
@@ -1562,7 +1590,7 @@ def main(args: Args) -> None:
         if exploration.random() < epsilon:
             action = int(exploration.integers(len(actions)))
         else:
-            action = greedy_action(q_network, decode(state))
+            action = greedy_action(working_network, decode(state))
         next_state, reward, terminated, truncated, info = env.step(action)
         replay.add(state, action, reward, next_state, terminated)
         state = next_state
@@ -1588,7 +1616,8 @@ def main(args: Args) -> None:
                 minibatch = replay.sample(args.optimizer_minibatch_size, minibatches)
             else:
                 minibatch = replay.gather(most_recent(replay, args.optimizer_minibatch_size))
-            loss, q = update(q_network, target_network, optimizer, minibatch, args.agent_discount_factor)
+            loss, q = update(q_network, working_network, target_network, optimizer, minibatch,
+                             args.agent_discount_factor)
             counters.updates += 1
 
         # 24-26  θ⁻ = θ
@@ -1596,7 +1625,7 @@ def main(args: Args) -> None:
             target_network.load_state_dict(q_network.state_dict())
 
         bar.update()
-        if counters.frames % LOG_INTERVAL == 0:
+        if counters.frames % log_interval == 0:
             stop_if_not_finite()
             seconds = time.monotonic() - window_time
             frames_per_second = (counters.frames - window.frames) / seconds

@@ -42,6 +42,7 @@ import csv
 import dataclasses
 import difflib
 import functools
+import inspect
 import io
 import itertools
 import os
@@ -62,6 +63,7 @@ import lz4.block
 import matplotlib
 import numpy as np
 import torch
+import torch.nn.functional as F
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
@@ -107,10 +109,12 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=__doc__)
+            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
     except SystemExit as stop:
         if stop.code != 2:
             raise
@@ -363,6 +367,14 @@ def decode_screen(code: bytes) -> np.ndarray:
 # ---- network ---------------------------------------------------------------------------------------
 
 
+class PixelConv2d(nn.Conv2d):
+    """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
+    and less work."""
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return F.conv2d(pixels, self.weight / 255, self.bias, self.stride)
+
+
 class QNetwork(nn.Module):
     """Table 2: (B, 4, 84, 84) uint8 states to (B, num_actions) float32 values Q(s, ·; θ)."""
 
@@ -371,17 +383,17 @@ class QNetwork(nn.Module):
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(OrderedDict(
-            conv1=nn.Conv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
-            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),              # (B, 64, 9, 9)
-            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),              # (B, 64, 7, 7)
-            flatten=nn.Flatten(),                                                                # (B, 3136)
-            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                   # (B, 512)
+            conv1=PixelConv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
+            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),                # (B, 64, 9, 9)
+            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),                # (B, 64, 7, 7)
+            flatten=nn.Flatten(),                                                                  # (B, 3136)
+            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                     # (B, 512)
         ))
-        self.head = nn.Linear(512, num_actions)                                                  # (B, num_actions)
+        self.head = nn.Linear(512, num_actions)                                                    # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        x = states.to(self.layers.conv1.weight.dtype) / 255           # (B, 4, 84, 84) in [0, 1]
-        return self.head(self.layers(x).to(self.head.weight.dtype))   # (B, num_actions) float32
+        x = self.layers(states.to(self.layers.conv1.weight.dtype))    # (B, 512)
+        return self.head(x.to(self.head.weight.dtype))                # (B, num_actions) float32
 
 
 def find_network(args: Args) -> Path:
@@ -396,8 +408,9 @@ def find_network(args: Args) -> Path:
     newest_last = sorted(Path(args.runs_dir).glob("*/q_network.pt"), key=lambda path: path.stat().st_mtime)
     if newest_last:
         return newest_last[-1]
-    for published in (Path(args.runs_dir) / "published", Path(__file__).resolve().parent.parent / "runs" / "published"):
-        for path in sorted(published.glob("*Pong*/q_network.pt")):
+    for runs in (Path(args.runs_dir), Path(__file__).resolve().parent.parent / "runs"):
+        path = runs / "published" / "pong" / "q_network.pt"
+        if path.is_file():
             return path
     raise ValueError(f"no network to play: no run under {args.runs_dir} and no published agent; "
                      "name a q_network.pt, or train one with dqn_atari.py")

@@ -30,6 +30,7 @@ import collections
 import contextlib
 import dataclasses
 import functools
+import inspect
 import io
 import itertools
 import json
@@ -87,10 +88,12 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=__doc__)
+            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
     except SystemExit as stop:
         if stop.code != 2:
             raise
@@ -689,8 +692,6 @@ def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
 
 def main() -> None:
     """Read the flags and the MDP, solve it, report; bad input ends in one line."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
     try:
         check_settings(args.discount, args.tolerance, args.max_iterations)

@@ -50,6 +50,7 @@ Measured on one x86-64 core (Python 3.11, Gymnasium 1.4.0, NumPy 2.4), mostly by
 
 import contextlib
 import dataclasses
+import inspect
 import io
 import itertools
 import json
@@ -129,10 +130,12 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=__doc__)
+            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
     except SystemExit as stop:
         if stop.code != 2:
             raise
@@ -584,8 +587,6 @@ def make_run_dir(runs_dir: Path, env_id: str, script: str, seed: int) -> Path:
 
 def main() -> None:
     """Learn, judge against Q* where the model is known, report."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(encoding="utf-8")  # a Windows console may not know π
     args = parse_args(Args)
     try:
         check_learning(args)

@@ -6,10 +6,12 @@
 One process after another on an otherwise idle machine: the same game, minibatch of 32, replay ratio, learning rate and
 interval of target copies, ε at 0.01, timed once learning is under way. dqn_atari.py is run as its users run it, timed
 by the frames per second that it logs; Stable-Baselines3's DQN (CnnPolicy, its own Atari wrappers) by a callback. Both
-warm up for 1,000 frames of learning and are then timed for `frames`. The floors are the bare emulator, four frames of
-it, and the update alone on a minibatch that is never changed.
+warm up for 1,000 frames of learning and are then timed for `frames`. They take turns for `rounds` rounds, since a
+shared machine's speed drifts; a speed is the median of its rounds and a ratio the median of the rounds' ratios. The
+floors are the bare emulator, four frames of it, and the update alone on a minibatch that is never changed.
 """
 
+import copy
 import dataclasses
 import json
 import os
@@ -33,6 +35,8 @@ WARM_UP = 2_000  # frames: 1,000 without learning, 1,000 with
 class Args:
     frames: int = 3_000
     """Frames that are timed, at one update per frame and at one in four."""
+    rounds: int = 3
+    """Times that each of the two is run, in turns."""
     env_id: str = "PongNoFrameskip-v4"
     """The game."""
     worker: str = ""
@@ -105,8 +109,8 @@ def parts(args: Args) -> dict[str, float]:
     memory = dqn.ReplayMemory(2_000, decode)
     torch.manual_seed(0)
     q_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n)).to(device)
-    target_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n)).requires_grad_(False).to(device)
-    target_network.layers.to(precision)
+    working_network = dqn.working_copy(q_network, precision)
+    target_network = copy.deepcopy(working_network).requires_grad_(False)
     optimizer = dqn.make_optimizer(script_args, q_network)
     state, _ = env.reset(seed=1)
 
@@ -131,10 +135,10 @@ def parts(args: Args) -> dict[str, float]:
     return {
         "emulate (floor: the bare emulator)": emulator,
         "preprocess, encode, store": frame - emulator,
-        "act": milliseconds(lambda: dqn.greedy_action(q_network, decode(state))),
+        "act": milliseconds(lambda: dqn.greedy_action(working_network, decode(state))),
         "sample": milliseconds(lambda: memory.sample(32, rng)),
         "update (floor: the update alone)": milliseconds(
-            lambda: dqn.update(q_network, target_network, optimizer, minibatch, 0.99)),
+            lambda: dqn.update(q_network, working_network, target_network, optimizer, minibatch, 0.99)),
     }
 
 
@@ -160,13 +164,17 @@ def main(args: Args) -> None:
     for name, value in times.items():
         rare = value / 4 if name.startswith(("sample", "update")) else value
         print(f"{name:<38}{value:>20.2f}{rare:>20.2f}")
-    for name in workers.keys() - {"parts"}:
-        times[name] = [measure(name, frequency, args) for frequency in (1, 4)]
-    print(f"\n{'frames a second':<38}{'update every frame':>20}{'update every 4th':>20}")
-    for name in ("dqn_atari.py", "Stable-Baselines3"):
-        print(f"{name:<38}{times[name][0]:>20.1f}{times[name][1]:>20.1f}")
-    ratios = [a / b for a, b in zip(times["dqn_atari.py"], times["Stable-Baselines3"], strict=True)]
-    print(f"{'ratio':<38}{ratios[0]:>20.2f}{ratios[1]:>20.2f}")
+    peers = ("dqn_atari.py", "Stable-Baselines3")
+    speeds = {(name, frequency): [] for name in peers for frequency in (1, 4)}
+    for _ in range(args.rounds):
+        for name, frequency in sorted(speeds, key=lambda key: key[1]):
+            speeds[name, frequency].append(measure(name, frequency, args))
+    ratios = {("ratio", frequency): np.divide(*(speeds[name, frequency] for name in peers)) for frequency in (1, 4)}
+    print(f"\n{f'frames a second, {args.rounds} rounds':<38}{'update every frame':>26}{'update every 4th':>26}")
+    for name, digits in ((peers[0], 1), (peers[1], 1), ("ratio", 2)):
+        columns = [(speeds | ratios)[name, frequency] for frequency in (1, 4)]
+        print(f"{name:<38}" + "".join(
+            f"{f'{np.median(x):.{digits}f} ({min(x):.{digits}f} to {max(x):.{digits}f})':>26}" for x in columns))
 
 
 if __name__ == "__main__":

@@ -47,13 +47,14 @@ def learn(args: Args, seed: int, precision: torch.dtype, memory, num_actions: in
     q_network = dqn.QNetwork(4, 84, 84, num_actions)
     dqn.initialize_orthogonal(q_network)
     optimizer = dqn.make_optimizer(script_args, q_network)
-    target_network = copy.deepcopy(q_network).requires_grad_(False)
-    target_network.layers.to(precision)
+    working_network = dqn.working_copy(q_network, precision)
+    target_network = copy.deepcopy(working_network).requires_grad_(False)
     held_out = memory.gather(np.arange(args.transitions, len(memory)))
     judgements = []
     for i in trange(1, args.updates + 1, desc=f"seed {seed}, {precision}", leave=False):
         minibatch = memory.gather(rng.integers(args.transitions, size=script_args.optimizer_minibatch_size))
-        dqn.update(q_network, target_network, optimizer, minibatch, script_args.agent_discount_factor)
+        dqn.update(q_network, working_network, target_network, optimizer, minibatch,
+                   script_args.agent_discount_factor)
         if i % 250 == 0:
             target_network.load_state_dict(q_network.state_dict())
         if i % (args.updates // 5) == 0:

@@ -1,5 +1,6 @@
 """dqn_atari.py: what silently breaks in DQN code, each against an oracle that shares nothing with the script."""
 
+import copy
 import csv
 import dataclasses
 import itertools
@@ -62,8 +63,8 @@ def train(tmp_path, monkeypatch):
             memories.append(make_memory(*arguments))
             return memories[-1]
 
-        def spy(q_network, target_network, *rest):
-            result = original_update(q_network, target_network, *rest)
+        def spy(q_network, working_network, target_network, *rest):
+            result = original_update(q_network, working_network, target_network, *rest)
             updates.append({"added": memories[-1].added, "target": target_network.head.weight.clone(),
                             "online": q_network.head.weight.detach().clone()})
             return result
@@ -362,7 +363,7 @@ def test_network_is_table_2():
             type(layer).__name__, tuple(output.shape[1:]), sum(p.numel() for p in layer.parameters()))))
     q = network(torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8))
     assert shapes == [
-        ("Conv2d", (32, 20, 20), 8224), ("ReLU", (32, 20, 20), 0),
+        ("PixelConv2d", (32, 20, 20), 8224), ("ReLU", (32, 20, 20), 0),
         ("Conv2d", (64, 9, 9), 32832), ("ReLU", (64, 9, 9), 0),
         ("Conv2d", (64, 7, 7), 36928), ("ReLU", (64, 7, 7), 0), ("Flatten", (3136,), 0), ("Linear", (512,), 1606144),
         ("ReLU", (512,), 0), ("Linear", (6,), 512 * 6 + 6)]
@@ -375,11 +376,13 @@ def test_network_is_table_2():
             assert torch.allclose(filters @ filters.T, torch.eye(len(filters)), atol=1e-5)
 
 
-def test_network_scales_its_input_once():
-    network, inputs = dqn.QNetwork(4, 84, 84, 2), []
-    network.layers.conv1.register_forward_pre_hook(lambda _, x: inputs.append(x[0]))
-    network(torch.full((1, 4, 84, 84), 255, dtype=torch.uint8))
-    assert inputs[0].unique().tolist() == [1.0]
+def test_network_scales_its_pixels_to_0_1():
+    network, outputs = dqn.QNetwork(4, 84, 84, 2), []
+    conv1 = network.layers.conv1
+    conv1.register_forward_hook(lambda *arguments: outputs.append(arguments[-1]))
+    pixels = torch.randint(0, 256, (3, 4, 84, 84), dtype=torch.uint8)
+    network(pixels)
+    assert torch.allclose(outputs[0], nn.functional.conv2d(pixels / 255, conv1.weight, conv1.bias, stride=4), atol=1e-5)
 
 
 # ---- the update ------------------------------------------------------------------------------------
@@ -408,7 +411,7 @@ def test_update_is_the_clipped_error_of_each_sample():
     states = torch.zeros((4, 4, 84, 84), dtype=torch.uint8)
     minibatch = (states, torch.tensor(a), torch.tensor(r), states, torch.tensor(terminal))
     optimizer = torch.optim.SGD(q_network.parameters(), lr=1.0)
-    loss, q = dqn.update(q_network, target_network, optimizer, minibatch, discount)
+    loss, q = dqn.update(q_network, q_network, target_network, optimizer, minibatch, discount)
     assert q.tolist() == [0.0, 0.5, 0.0, 1.0]
     assert torch.allclose(q_network.rows, torch.tensor(expected))
     assert target_network.rows.tolist() == Table(target_table).rows.tolist() and target_network.rows.grad is None
@@ -421,14 +424,20 @@ def test_bfloat16_updates_keep_float32_weights_and_nearly_the_same_gradient():
     gradients = {}
     s, s_next = torch.randint(0, 256, (2, 32, 4, 84, 84), dtype=torch.uint8)
     minibatch = (s, torch.randint(0, 4, (32,)), torch.randn(32), s_next, torch.zeros(32, dtype=torch.bool))
-    q_network = dqn.QNetwork(4, 84, 84, 4)
     for precision in (torch.float32, torch.bfloat16):
-        target_network = dqn.QNetwork(4, 84, 84, 4).requires_grad_(False)
-        target_network.load_state_dict(q_network.state_dict())
-        target_network.layers.to(precision)
-        optimizer = torch.optim.SGD(q_network.parameters(), lr=0.0)
-        dqn.update(q_network, target_network, optimizer, minibatch, 0.99)
+        torch.manual_seed(1)
+        q_network = dqn.QNetwork(4, 84, 84, 4)
+        before = [parameter.detach().clone() for parameter in q_network.parameters()]
+        working_network = dqn.working_copy(q_network, precision)
+        target_network = copy.deepcopy(working_network).requires_grad_(False)
+        optimizer = torch.optim.SGD(q_network.parameters(), lr=1e-3)
+        dqn.update(q_network, working_network, target_network, optimizer, minibatch, 0.99)
         gradients[precision] = torch.cat([p.grad.flatten() for p in q_network.parameters()])
+        for old, θ, working in zip(before, q_network.parameters(), working_network.parameters(), strict=True):
+            assert θ.dtype == torch.float32
+            # steps of about 1e-5, in weights of about 0.01: bfloat16's three digits would lose them
+            assert torch.allclose(old - θ.detach(), 1e-3 * θ.grad, rtol=1e-3, atol=1e-8)
+            assert torch.equal(working, θ.to(working.dtype))
     exact, rounded = gradients.values()
     assert rounded.dtype == torch.float32 and not torch.equal(exact, rounded)
     assert torch.cosine_similarity(exact, rounded, dim=0) > 0.999
@@ -505,7 +514,7 @@ def test_a_dead_network_says_so(train, monkeypatch, capsys):
     monkeypatch.setattr(dqn, "update", kill)
     train()
     (warning,) = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]  # once, at once
-    assert "frame 100" in warning and "dead_units_conv3" in warning
+    assert "frame 104" in warning and "dead_units_conv3" in warning
 
 
 def test_dead_units_and_spread_are_counted():

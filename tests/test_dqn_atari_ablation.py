@@ -113,12 +113,12 @@ def arms(tmp_path_factory):
         for target, replay in ARMS:
             stored, updates, first = [], [], {}
 
-            def spy(q_network, target_network, optimizer, minibatch, *rest, of=(stored, updates, first)):
+            def spy(q_network, working, target_network, optimizer, minibatch, *rest, of=(stored, updates, first)):
                 stored, updates, first = of
                 if not first:
                     first |= {name: tensor.clone() for name, tensor in q_network.state_dict().items()}
                 updates.append((len(stored), minibatch, equal(q_network.state_dict(), target_network.state_dict())))
-                result = original(q_network, target_network, optimizer, minibatch, *rest)
+                result = original(q_network, working, target_network, optimizer, minibatch, *rest)
                 assert all(parameter.grad is None for parameter in target_network.parameters())
                 return result
 

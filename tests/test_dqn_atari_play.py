@@ -349,8 +349,8 @@ def test_any_game(env_id, network, tmp_path, monkeypatch):
 
 def test_without_an_argument_it_takes_the_newest_run_then_the_published_one(tmp_path):
     args = play.Args(runs_dir=str(tmp_path))
-    published = tmp_path / "published" / "PongNoFrameskip-v4__dqn_atari__1" / "q_network.pt"
-    for path in (published, published.parent.parent / "BreakoutNoFrameskip-v4__dqn_atari__1" / "q_network.pt"):
+    published = tmp_path / "published" / "pong" / "q_network.pt"
+    for path in (published, published.parent.parent / "breakout" / "q_network.pt"):
         path.parent.mkdir(parents=True)
         path.touch()
     assert play.find_network(args) == published

@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 FRAMES = 500
 SHORT = dict(environment_train_frames_max=FRAMES, agent_replay_buffer_initial=150, optimizer_minibatch_size=8,
              agent_update_frequency=4, environment_test_frames=150, environment_evaluation_interval_episodes=4,
-             environment_evaluation_episodes=1, environment_checkpoint_interval_episodes=3,
+             environment_evaluation_episodes=1, environment_checkpoint_interval_episodes=2,
              optimizer_q_network_parameter_update_interval_frames=70)
 CAP = {"BreakoutNoFrameskip-v4": 108_000, "PongNoFrameskip-v4": 400}  # Pong: an episode every 100 frames
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, SIGKILL and file-size limits")
@@ -95,7 +95,7 @@ def everything(run_dir: Path) -> dict:
 @pytest.fixture(scope="module", params=CAP)
 def straight(request, tmp_path_factory):
     """A run that never stopped: (game, all that it left, the frames at which something happened)."""
-    moments = {"before learning": 60}
+    moments = {"before learning": 140}
 
     def watch(frame, transition):
         if transition[4] and "a lost life" not in moments:
@@ -175,6 +175,32 @@ def test_training_on_is_having_trained_longer_from_the_start(straight, tmp_path)
     assert left == expected
 
 
+@posix
+def test_a_kill_anywhere_and_resuming_is_never_having_stopped(straight, tmp_path):
+    env_id, expected, moments = straight
+    resumed = 0
+    for name, frame in moments.items():
+        folder = tmp_path / name
+        _, status = os.waitpid(in_a_child(folder, env_id=env_id, before_frame=stop_at(frame, signal.SIGKILL)), 0)
+        assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL, (tmp_path / "child.log").read_text()
+        (run_dir,) = folder.iterdir()
+        if (run_dir / "checkpoint.pt").exists():
+            assert dqn.load_checkpoint(run_dir / "checkpoint.pt")[0]["counters"]["frames"] < frame, name
+            assert run(folder, env_id, resume=run_dir)[0] == 0, name
+            assert everything(run_dir) == expected, name
+            resumed += 1
+    assert resumed >= 2
+
+
+@pytest.mark.parametrize("frame", [251, 260])
+def test_a_point_of_the_curves_right_after_resuming_is_not_lost(frame, tmp_path):
+    flags = dict(agent_update_frequency=3)  # does not divide the interval of the points
+    _, expected = run(tmp_path / "straight", **flags)
+    _, run_dir = run(tmp_path / "stopped", before_frame=stop_at(frame), **flags)
+    assert run(tmp_path / "stopped", resume=run_dir)[0] == 0
+    assert everything(run_dir) == everything(expected)
+
+
 @pytest.mark.parametrize("encoding", ["raw", "tensor"])
 def test_other_encodings_resume_exactly(encoding, tmp_path):
     results = []
@@ -217,8 +243,8 @@ def in_a_child(folder: Path, limit: int | None = None, **arguments) -> int:
 
 @posix
 def test_thirty_kills_while_checkpointing_lose_nothing(tmp_path):
-    flags = dict(environment_checkpoint_interval_episodes=1, environment_evaluation_interval_episodes=1000,
-                 agent_update_frequency=8, environment_train_frames_max=300)
+    flags = dict(environment_checkpoint_interval_episodes=1, agent_update_frequency=8,
+                 environment_train_frames_max=300)
     folder, rng = tmp_path / "killed", np.random.default_rng(0)
     folder.mkdir()
     started = time.monotonic()
@@ -243,8 +269,7 @@ def test_thirty_kills_while_checkpointing_lose_nothing(tmp_path):
         if saved:
             dqn.load_checkpoint(checkpoint)  # whole, whatever the moment
     _, run_dir = run(folder, resume=checkpoint.parent) if saved else run(tmp_path / "again", **flags)
-    states = [plain(dqn.load_checkpoint(path / "checkpoint.pt")[0]["q_network"]) for path in (run_dir, expected)]
-    assert states[0] == states[1]
+    assert everything(run_dir) == everything(expected)
 
 
 @posix

@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
@@ -97,3 +98,22 @@ def test_readme_commands_are_the_ones_that_ci_runs():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(re.findall(r"^.*python -m pytest.*$", readme, re.MULTILINE)) == 1
     assert "python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4" in readme
+
+
+def test_readme_python_solves_a_model_of_arrays():
+    """The README's snippet, run on random arrays; the oracle is a loop over states, actions and successors."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    rng, size, discount = np.random.default_rng(0), 30, 0.95
+    data, indices = rng.dirichlet(np.ones(3), 4 * size), rng.integers(0, size, (4 * size, 3))
+    names = {"size": size, "data": data.ravel(), "indices": indices.ravel(), "indptr": np.arange(4 * size + 1) * 3,
+             "R": rng.random(4 * size), "start": np.eye(size)[0]}
+    exec(snippet, names)
+    V = [0.0] * size
+    for _ in range(600):  # 0.95^600 is below 1e-13
+        Q = [[names["R"][4 * s + a] + discount * sum(p * V[t] for p, t in zip(data[4 * s + a], indices[4 * s + a],
+                                                                              strict=True))
+              for a in range(4)] for s in range(size)]
+        V = [max(row) for row in Q]
+    assert np.allclose(names["V"], V, atol=1e-6)
+    assert names["policy"].tolist() == [row.index(max(row)) for row in Q]
