@@ -84,6 +84,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import zipfile
 from collections import OrderedDict, deque
@@ -828,6 +829,13 @@ class Curves:
     def __init__(self, run_dir: Path, first_frame: int):
         # what a killed process logged after its last checkpoint is logged again: purge_step hides the first copy
         self.run_dir, self.purge_step, self.writer = run_dir, first_frame or None, None
+        threading.excepthook = self.silence_full_disk
+
+    @staticmethod
+    def silence_full_disk(failure) -> None:
+        """TensorBoard writes in a thread of its own: what the disk refuses it `attempt` says, not a traceback."""
+        if not issubclass(failure.exc_type, OSError):
+            threading.__excepthook__(failure)
 
     def write(self, add) -> None:
         """Call add(writer); after a failure the next call begins a new event file."""

@@ -310,6 +310,24 @@ def test_curves_that_cannot_be_written_do_not_end_the_run(tmp_path, capsys, monk
 
 
 @posix
+def test_a_full_disk_shows_no_traceback_of_tensorboards_thread(tmp_path):
+    code = """
+import resource, sys, time
+import dqn_atari as dqn
+from pathlib import Path
+curves = dqn.Curves(Path(sys.argv[1]), 0)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+for frame in range(200):
+    curves.add({"charts/epsilon": 1.0}, frame)
+    curves.flush()
+    time.sleep(0.005)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=ALGORITHMS, capture_output=True, text=True)
+    line = "warning: a point of the curves could not be written (File too large); training goes on"
+    assert done.returncode == 0 and set(done.stderr.splitlines()) == {line}, done.stderr
+
+
+@posix
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_saves_and_prints_the_command_that_resumes(tmp_path, signum, code):
     process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari.py", "--environment-test-frames", "100"],
