@@ -6,7 +6,7 @@
 # ]
 # ///
 """Deep Q-Learning on Atari games: Algorithm 6 of the lecture (ECE 544NA, Lecture 27, §5.3 and §7), the method of
-Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015).
+Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), [8] below.
 
 Run it
     python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4          # Table 3's hyperparameters, 10 million frames
@@ -19,6 +19,10 @@ The column of the Nature paper (Figure 18; 50 million frames):
         --optimizer-name RMSprop --optimizer-learning-rate 0.00025 --agent-update-frequency 4 \\
         --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \\
         --optimizer-q-network-parameter-update-interval-frames 40000
+
+How to read it
+    The end of `main` is Algorithm 6, line by line, and `update` its lines 19 to 22; then `ReplayMemory`, `QNetwork` and
+    the wrappers. "report and checkpoint" is what keeps hours of work safe: it can wait.
 
 Measured
     Pong, seed 1, one thread on two CPU cores shared with other work, PyTorch 2.13, stopped after 56 minutes, 187,588
@@ -346,8 +350,8 @@ class RewardClip(gym.Wrapper):
 
 class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only). info["game_over"] tells a
-    game's end from a life's. Easy to get wrong: a reset() after a lost life must neither reset nor step the emulator,
-    or the later lives are never seen, or seen from a frame that no transition holds."""
+    game's end from a life's. Easy to get wrong: after a lost life reset() returns the very frame that the episode ended
+    with. If it reset the emulator, the later lives would never be seen; if it stepped, a frame would be missed."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -486,7 +490,7 @@ class ReplayMemory:
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
         """The transitions at `indices` (B,), as `sample` returns them."""
         codes = [code for i in indices for code in self.frames[i]]
-        frames = self.decode(codes).unflatten(0, (len(indices), -1))  # (B, 5, 84, 84) uint8
+        frames = self.decode(codes).unflatten(0, (len(indices), -1))  # (B, 5, 84, 84) uint8: s the first 4, s' the last
         columns = [torch.from_numpy(column[indices]).to(frames.device, non_blocking=True)
                    for column in (self.actions, self.rewards, self.terminals)]
         return frames[:, :-1], columns[0], columns[1], frames[:, 1:], columns[2]
@@ -603,14 +607,16 @@ def update(q_network: QNetwork, working_network: QNetwork, target_network: QNetw
     # Q(s_j, a_j; θ)
     q = working_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
-    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1].
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum, as in line 22; Adam's
+    # steps do not depend on the loss's scale, RMSProp's learning rate is meant for the sum.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the mean of the minibatch.
     assert q.shape == y.shape == r.shape
     loss = F.huber_loss(q, y, reduction="sum")  # ()
     working_network.zero_grad()
     loss.backward()
 
-    # The gradient moves θ in float32, where a small step is not rounded away; then θ is cast anew.
+    # The gradient moves θ in float32, where a small step is not rounded away; then θ is cast anew. (Where the two are
+    # one network, both loops change nothing.)
     pairs = list(zip(q_network.parameters(), working_network.parameters(), strict=True))
     for θ, working in pairs:
         θ.grad = working.grad.float()
@@ -839,7 +845,9 @@ def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tupl
         return len(blobs) - 1
 
     def number(codes: tuple, before: tuple, row: list[int]) -> list[int]:
-        """The places of `codes` in `blobs`, given those of the transition before: only neighbours share frames."""
+        """The places of `codes` in `blobs`. Only neighbours share frames, so the transition before is all to look at:
+        after (a, b, c, d, e) at [0, 1, 2, 3, 4] comes (b, c, d, e, f) at [1, 2, 3, 4, 5], and only f is added; a new
+        episode (g, g, g, g, h) shares nothing and is at [6, 6, 6, 6, 7]."""
         if row and all(map(operator.is_, codes, before[1:])):
             return [*row[1:], *map(add, codes[len(before) - 1 :])]
         places = {key: add(code) for key, code in {id(code): code for code in codes}.items()}
@@ -1001,7 +1009,7 @@ def choose_encoding(args: Args, device: torch.device) -> tuple[str, float]:
 
 
 def choose_device(args: Args) -> tuple[torch.device, torch.dtype]:
-    """The device, and the type of the numbers inside an update."""
+    """The device, and the type of the numbers in the networks that act and learn."""
     name = args.device
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
@@ -1041,8 +1049,8 @@ def main(args: Args) -> None:
     shape = args.environment_state_height, args.environment_state_width
     encode, decode = encoding = frame_encoding(encoding_name, *shape, device)
     seeds = np.random.SeedSequence(args.seed).spawn(3)
-    exploration, minibatches, no_ops = generators = [np.random.default_rng(seed) for seed in seeds]
-    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=True)
+    exploration_rng, minibatch_rng, no_op_rng = generators = [np.random.default_rng(seed) for seed in seeds]
+    env = preprocess(make_emulator(args.env_id), args, encode, no_op_rng, training=True)
     actions = wrapper(env, JoystickActions).meanings
     # 2  Initialize 𝒟.
     replay = ReplayMemory(min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max), decode)
@@ -1076,7 +1084,8 @@ def main(args: Args) -> None:
           f"device   {device}, {torch.get_num_threads()} threads; training in {str(precision).removeprefix('torch.')}\n"
           f"network  {sum(parameter.numel() for parameter in q_network.parameters()):,} parameters\n"
           f"replay   {replay.capacity:,} transitions as {encoding_name}: about {gigabytes(replay_bytes)} when full, "
-          f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free\n"
+          f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free; "
+          f"learning starts with {args.agent_replay_buffer_initial:,}\n"
           f"run      {run_dir}" + (f", resumed at frame {counters.frames:,}" if resumed else ""), flush=True)
 
     if args.agent_replay_buffer_initial > args.environment_train_frames_max:
@@ -1120,8 +1129,10 @@ def main(args: Args) -> None:
         return attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
-               **bar_style())
+               bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]", **bar_style())
 
+    # 5-7 are `counters`; ε is a function of the frame. Evaluation stands first, so that one that was cut off is done
+    # again when the run is resumed.
     # 8  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max:
         # 27-29  Evaluate the agent.
@@ -1151,8 +1162,8 @@ def main(args: Args) -> None:
 
         # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q_θ(s, a); reduce ε; add (s, a, r, s') to 𝒟.
         epsilon = epsilon_at(counters.frames, args)
-        if exploration.random() < epsilon:
-            action = int(exploration.integers(len(actions)))
+        if exploration_rng.random() < epsilon:
+            action = int(exploration_rng.integers(len(actions)))
         else:
             action = greedy_action(working_network, decode(state))
         next_state, reward, terminated, truncated, info = env.step(action)
@@ -1176,12 +1187,12 @@ def main(args: Args) -> None:
 
         # 18-23  If |𝒟| ≥ initial, sample ℬ ⊆ 𝒟, compute y and perform one iteration of gradient descent.
         if len(replay) >= args.agent_replay_buffer_initial and counters.frames % args.agent_update_frequency == 0:
-            minibatch = replay.sample(args.optimizer_minibatch_size, minibatches)
+            minibatch = replay.sample(args.optimizer_minibatch_size, minibatch_rng)
             loss, q = update(q_network, working_network, target_network, optimizer, minibatch,
                              args.agent_discount_factor)
             counters.updates += 1
 
-        # 24-26  θ⁻ = θ
+        # 24-26  θ⁻ = θ, in the precision of the working network
         if counters.frames % args.optimizer_q_network_parameter_update_interval_frames == 0:
             target_network.load_state_dict(q_network.state_dict())
 
@@ -1216,7 +1227,7 @@ def main(args: Args) -> None:
         print(f"error: stopped at frame {counters.frames:,}, which {run_dir} could not keep", file=sys.stderr)
         raise SystemExit(1)
     if stop.signum:
-        print(f"stopped at frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
+        print(f"stopped at frame {counters.frames:,}; go on with: {sys.executable} {sys.argv[0]} --resume {run_dir}")
         raise SystemExit(128 + stop.signum)
 
     count_seconds()

@@ -265,8 +265,8 @@ class RewardClip(gym.Wrapper):
 
 class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only). info["game_over"] tells a
-    game's end from a life's. Easy to get wrong: a reset() after a lost life must neither reset nor step the emulator,
-    or the later lives are never seen, or seen from a frame that no transition holds."""
+    game's end from a life's. Easy to get wrong: after a lost life reset() returns the very frame that the episode ended
+    with. If it reset the emulator, the later lives would never be seen; if it stepped, a frame would be missed."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)

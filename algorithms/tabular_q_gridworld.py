@@ -14,6 +14,7 @@ lecture's undiscounted Equation 34 and moves that slip in 2 of 10 cases, that po
 not end the episode pays between -0.0274 and -0.0221, and for no discount at a step reward of 0: hence --step-reward
 -0.025 (`python benchmarks/gridworld.py step-rewards` solves the model along the step reward, and prints all changes).
 
+Run it
     python algorithms/tabular_q_gridworld.py                        # 1,000 episodes, as for Figure 9
     python algorithms/tabular_q_gridworld.py --episodes 200000      # until the policy is Figure 10's
     python algorithms/tabular_q_gridworld.py --learning-rate 1 --learning-rate-exponent 0.7     # quick, and less exact
@@ -23,29 +24,30 @@ not end the episode pays between -0.0274 and -0.0221, and for no discount at a s
     python algorithms/tabular_q_gridworld.py --env-id FrozenLake-v1 --env-kwargs is_slippery=false --discount 0.9
     tensorboard --logdir runs
 
-Measured on one x86-64 core (Python 3.11, Gymnasium 1.4.0, NumPy 2.4), mostly by `python benchmarks/gridworld.py`:
-- seeds: with --episodes 200000, seeds 0 to 19, the policy is Figure 10's and optimal in all nine cells for 20 of 20
-  seeds, with max |Q - Q*| from 0.0035 to 0.0238. After the default 1,000 episodes, with seed 0, it is optimal in 6 of 9
-  cells and max |Q - Q*| = 0.672: a robot that learns slowly enough to tell 0.546 from 0.543 in (4,1) is slow at first.
-  With --learning-rate 1 --learning-rate-exponent 0.7 the same 1,000 episodes give 9 of 9 cells and 0.210.
-- speed: 538,720 steps per second in the learning loop; 38% of that time is the environment's.
-- CliffWalking-v1 as above: max |Q - Q*| = 0.0000, and an optimal action in 37 of 37 states.
+Measured on one x86-64 core (Python 3.11, Gymnasium 1.4.0, NumPy 2.4), mostly by `python benchmarks/gridworld.py`
+    Seeds 0 to 19 with --episodes 200000: the policy is Figure 10's and optimal in all nine cells for 20 of 20 seeds,
+    with max |Q - Q*| from 0.0035 to 0.0238. After the default 1,000 episodes, with seed 0, it is optimal in 6 of 9
+    cells and max |Q - Q*| = 0.672: a robot that learns slowly enough to tell 0.546 from 0.543 in (4,1) is slow at
+    first. With --learning-rate 1 --learning-rate-exponent 0.7 the same 1,000 episodes give 9 of 9 cells and 0.210.
+    Speed: 538,720 steps per second in the learning loop; 38% of that time is the environment's.
+    CliffWalking-v1 as above: max |Q - Q*| = 0.0000, and an optimal action in 37 of 37 states.
 
-  The lecture says                        this file does                        why
-  --------------------------------------  ------------------------------------  ---------------------------------------
-  repeat until Q has converged            --episodes of them                    whether it has, samples do not tell
-  Equation 34 has no discount             --discount, 1 by default              other environments need one
-  α in (0, 1]                             0.7 · N(s,a)^-0.85, N(s,a) visits     a constant α (exponent 0) never settles;
+Deviations
+    The lecture says                      this file does                        why
+    ------------------------------------  ------------------------------------  ---------------------------------------
+    repeat until Q has converged          --episodes of them                    whether it has, samples do not tell
+    Equation 34 has no discount           --discount, 1 by default              other environments need one
+    α in (0, 1]                           0.7 · N(s,a)^-0.85, N(s,a) visits     a constant α (exponent 0) never settles;
                                                                                 a large one overshoots in (4,1), where
                                                                                 "down" mostly stays and forgets slowly
-  "some schedule" of ε, per transition    linear in episodes, from 1 to 0.7     the number of steps is not known before;
+    "some schedule" of ε, per transition  linear in episodes, from 1 to 0.7     the number of steps is not known before;
                                                                                 Q-learning is off-policy, and a greedier
                                                                                 robot hardly ever sees (4,1)
-  r + max Q(s',a') for every s'           r alone where the episode terminated  Equation 36: nothing comes after the end
-  no word on ties                         broken at random, and named           the first one is "left", for ever
-  no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
+    r + max Q(s',a') for every s'         r alone where the episode terminated  Equation 36: nothing comes after the end
+    no word on ties                       broken at random, and named           the first one is "left", for ever
+    no word on time limits                1,000 steps cut an episode short      a policy may never end; the target still
                                                                                 looks ahead, for the world does go on
-  1000 interactions (Figure 9)            1,000 episodes                        1,000 transitions are about 30 episodes
+    1000 interactions (Figure 9)          1,000 episodes                        1,000 transitions are about 30 episodes
 """
 
 import contextlib
@@ -655,7 +657,8 @@ def main() -> None:
             result |= {"max_error": errors[-1], "optimal_states": optimal[-1], "states": int(deciding.sum())}
             print(f"max |Q - Q*| = {errors[-1]:.4f}; the policy is optimal in {optimal[-1]} of {deciding.sum()} states")
         last = evaluation.episode - (history[-2].episode if len(history) > 1 else 0)
-        print(f"mean return of the last {last} episodes: {evaluation.mean_return:.4g} (ε = {evaluation.epsilon:.2f})")
+        print(f"mean return of the last {last} episodes, while exploring with ε = {evaluation.epsilon:.2f}: "
+              f"{evaluation.mean_return:.4g}")
         print(f"written to {run_dir}")
         output = args.output_json or run_dir / "q_table.json"
         output.write_text(json.dumps(table | result, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -16,23 +16,26 @@ by the one s' that came, and the assignment by a running average,
 V as learnt stands beside V^π from the linear system of Equations 2 and 3, for here the model is known, though not to
 the learner. World and default rewards are those of tabular_q_gridworld.py, whose docstring says where they come from.
 
+Run it
     python algorithms/value_learning_gridworld.py                            # the optimal policy, which is Figure 10's
     python algorithms/value_learning_gridworld.py --no-exploring-starts      # V only where episodes from (1,1) go
     python algorithms/value_learning_gridworld.py \
         --policy "1,1=right 2,1=right 3,1=up 4,1=left 1,2=up 3,2=up 1,3=right 2,3=right 3,3=right"    # past the -1
     tensorboard --logdir runs
 
-Measured with the default 20,000 episodes and seed 0: max |V - V^π| = 0.0206 over the nine cells.
+Measured
+    With the default 20,000 episodes and seed 0: max |V - V^π| = 0.0206 over the nine cells.
 
-  The lecture says                        this file does                        why
-  --------------------------------------  ------------------------------------  ---------------------------------------
-  no algorithm                            TD(0)                                 its update is Equation 34 with π for max
-  every episode starts in (1,1)           in a random cell, by default          the optimal policy never gets to (4,1):
+Deviations
+    The lecture says                      this file does                        why
+    ------------------------------------  ------------------------------------  ---------------------------------------
+    no algorithm                          TD(0)                                 its update is Equation 34 with π for max
+    every episode starts in (1,1)         in a random cell, by default          the optimal policy never gets to (4,1):
                                                                                 V there would not be learnt
-  no discount                             --discount, 1 by default              as in the other scripts
-  no word on time limits                  1,000 steps cut an episode short      a policy may never end; the target still
+    no discount                           --discount, 1 by default              as in the other scripts
+    no word on time limits                1,000 steps cut an episode short      a policy may never end; the target still
                                                                                 looks ahead, for the world does go on
-  no word on α                            N(s)^-0.7, N(s) visits of the cell    a constant α (exponent 0) never settles
+    no word on α                          N(s)^-0.7, N(s) visits of the cell    a constant α (exponent 0) never settles
 """
 
 import contextlib

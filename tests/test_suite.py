@@ -101,19 +101,17 @@ def test_readme_commands_are_the_ones_that_ci_runs():
 
 
 def test_readme_python_solves_a_model_of_arrays():
-    """The README's snippet, run on random arrays; the oracle is a loop over states, actions and successors."""
+    """The README's snippet; the oracle is a loop over states, actions and successors."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-    rng, size, discount = np.random.default_rng(0), 30, 0.95
-    data, indices = rng.dirichlet(np.ones(3), 4 * size), rng.integers(0, size, (4 * size, 3))
-    names = {"size": size, "data": data.ravel(), "indices": indices.ravel(), "indptr": np.arange(4 * size + 1) * 3,
-             "R": rng.random(4 * size), "start": np.eye(size)[0]}
-    exec(snippet, names)
-    V = [0.0] * size
+    names = {}
+    exec(snippet.replace("size = np.random.default_rng(0), 1000", "size = np.random.default_rng(0), 30"), names)
+    assert len(names["V"]) == 30
+    V, discount = [0.0] * 30, 0.95
     for _ in range(600):  # 0.95^600 is below 1e-13
-        Q = [[names["R"][4 * s + a] + discount * sum(p * V[t] for p, t in zip(data[4 * s + a], indices[4 * s + a],
-                                                                              strict=True))
-              for a in range(4)] for s in range(size)]
+        Q = [[names["R"][row] + discount * sum(p * V[t] for p, t in zip(names["data"][row], names["indices"][row],
+                                                                       strict=True))
+              for row in range(4 * s, 4 * s + 4)] for s in range(30)]
         V = [max(row) for row in Q]
     assert np.allclose(names["V"], V, atol=1e-6)
     assert names["policy"].tolist() == [row.index(max(row)) for row in Q]
