@@ -11,7 +11,7 @@
 Run it
     python algorithms/dqn_atari_play.py                                      # the newest run under runs/
     python algorithms/dqn_atari_play.py runs/RUN/q_network.pt                # this network
-    python algorithms/dqn_atari_play.py runs/RUN --seed 7 --moments 5 --show-layers
+    python algorithms/dqn_atari_play.py runs/RUN --seed 7 --moments 5 --show-layers --video-seconds 30
     python algorithms/dqn_atari_play.py runs/RUN --games 30                  # score and length, mean and variance
 
 Without a run it plays the published Pong agent. Beside the network, in play-seed1-…/, it leaves
@@ -45,6 +45,7 @@ import functools
 import inspect
 import io
 import itertools
+import math
 import os
 import pickle
 import sys
@@ -95,6 +96,8 @@ class Args:
     """Seed of the random actions and of the no-operations that a game begins with; same seed, same trace."""
     moments: int = 3
     """Largest drops or rises of the value to show, three frames each [Figures 21, 22, 24, …]."""
+    video_seconds: float = math.inf
+    """Length of the video, seconds from the game's beginning; inf shows the whole game."""
     show_layers: bool = False
     """Draw the filters of the first layer too, in filters.png [Table 2: 32 of 8×8 pixels, for each of 4 frames]."""
     runs_dir: str = "runs"
@@ -129,6 +132,8 @@ def check_flags(args: Args) -> None:
     for name, least in (("games", 1), ("moments", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, not {getattr(args, name)}")
+    if not args.video_seconds > 0:
+        raise ValueError(f"--video-seconds must be above 0, not {args.video_seconds}")
 
 
 # ---- problem: the Atari environment and its wrappers -----------------------------------------------
@@ -736,7 +741,7 @@ def save_video(path: Path, recording: list[tuple], frames: list[Frame], actions:
     state's screen shows the action before, so the panel changes when the action starts. Raises OSError."""
     height, screen_width = (2 * side for side in decode_screen(recording[0][0]).shape[:2])
     panel = Panel(height, frames, actions, title)
-    ends = [*(frame.recorded for frame in frames[1:]), len(recording)]
+    ends = [*(frame.recorded for frame in frames[1:] if frame.recorded < len(recording)), len(recording)]
     temporary = path.with_name("unfinished-" + path.name)
     with silent_stderr():
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"VP80"), FRAMES_PER_SECOND,
@@ -816,7 +821,8 @@ def main(args: Args) -> None:
         save_moments(folder / "moments.png", frames, moments, actions, f"{title}: where the value jumps")
         if args.show_layers:
             save_filters(folder / "filters.png", q_network, trained.env_id)
-        save_video(folder / "episode.webm", recording, frames, actions, trained.env_id)
+        shown = recording[: math.ceil(min(args.video_seconds * FRAMES_PER_SECOND, len(recording)))]
+        save_video(folder / "episode.webm", shown, frames, actions, trained.env_id)
     except KeyboardInterrupt:
         print(f"stopped; what was finished is in {folder}", file=sys.stderr)
         raise SystemExit(130) from None

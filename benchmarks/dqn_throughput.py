@@ -3,20 +3,20 @@
     pip install -r requirements.txt -r benchmarks/requirements.txt
     python benchmarks/dqn_throughput.py
 
-One process after another on an otherwise idle machine: the same game, minibatch of 32, replay ratio, learning rate and
-interval of target copies, ε at 0.01, timed once learning is under way. dqn_atari.py is run as its users run it, timed
-by the frames per second that it logs; Stable-Baselines3's DQN (CnnPolicy, its own Atari wrappers) by a callback. Both
-warm up for 1,000 frames of learning and are then timed for `frames`. They take turns for `rounds` rounds, since a
-shared machine's speed drifts; a speed is the median of its rounds and a ratio the median of the rounds' ratios. The
-floors are the bare emulator, four frames of it, and the update alone on a minibatch that is never changed.
+The same game, minibatch of 32, replay ratio, learning rate and interval of target copies, ε at 0.01, timed once
+learning is under way, on an otherwise idle machine. The two run in processes of their own that take turns, 100 frames
+each while the other waits: both see the same machine, whose speed may drift. dqn_atari.py is run whole, as its users
+run it; Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers. Both warm up for 1,000 frames without and
+1,000 with learning. The floors are the bare emulator, four frames of it, and the update alone on a minibatch that is
+never changed.
 """
 
+import contextlib
 import copy
 import dataclasses
-import json
+import multiprocessing
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,40 +29,56 @@ import tyro
 ALGORITHMS = Path(__file__).parent.parent / "algorithms"
 sys.path.insert(0, str(ALGORITHMS))
 WARM_UP = 2_000  # frames: 1,000 without learning, 1,000 with
+TURN = 100  # frames
 
 
 @dataclasses.dataclass
 class Args:
     frames: int = 3_000
-    """Frames that are timed, at one update per frame and at one in four."""
-    rounds: int = 3
-    """Times that each of the two is run, in turns."""
+    """Frames of each that are timed, at one update per frame and at one in four."""
     env_id: str = "PongNoFrameskip-v4"
     """The game."""
-    worker: str = ""
-    """Used by the benchmark itself: what this process measures."""
-    update_frequency: int = 1
-    """Used by the benchmark itself: frames per update."""
 
 
-def ours(args: Args) -> float:
-    """Frames per second that dqn_atari.py logs after the warm-up."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+class Turns:
+    """Lets a process run TURN frames at a time, in turns with another; keeps the seconds of the turns after warm-up."""
 
+    def __init__(self, mine, theirs):
+        self.mine, self.theirs = mine, theirs  # semaphores
+        self.frames, self.seconds = 0, []
+        mine.acquire()
+        self.started = time.perf_counter()
+
+    def frame(self) -> None:
+        """To be called after every frame."""
+        self.frames += 1
+        if self.frames % TURN == 0:
+            if self.frames > WARM_UP:
+                self.seconds.append(time.perf_counter() - self.started)
+            self.theirs.release()
+            self.mine.acquire()
+            self.started = time.perf_counter()
+
+
+def ours(args: Args, update_frequency: int, turns: Turns) -> None:
+    """Run dqn_atari.py; a frame is an update of its progress bar."""
+    import dqn_atari as dqn
+
+    class Bar(dqn.tqdm):
+        def update(self, n=1):
+            super().update(n)
+            turns.frame()
+
+    dqn.tqdm = Bar
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run(
-            [sys.executable, ALGORITHMS / "dqn_atari.py", "--env-id", args.env_id, "--runs-dir", folder,
-             "--environment-train-frames-max", str(WARM_UP + args.frames), "--agent-replay-buffer-initial", "1000",
-             "--agent-update-frequency", str(args.update_frequency), "--agent-epsilon-greedy-annealing", "1000",
-             "--environment-test-frames", "1"], check=True, capture_output=True)
-        (run_dir,) = Path(folder).iterdir()
-        points = EventAccumulator(str(run_dir)).Reload().Scalars("charts/frames_per_second")
-        windows = [point.value for point in points if point.step > WARM_UP]
-    return len(windows) / sum(1 / rate for rate in windows)  # all windows have the same number of frames
+        dqn.main(dqn.Args(
+            env_id=args.env_id, runs_dir=folder, environment_train_frames_max=WARM_UP + args.frames,
+            agent_replay_buffer_initial=1000, agent_update_frequency=update_frequency,
+            agent_epsilon_greedy_annealing=1000, environment_test_frames=1))
 
 
-def stable_baselines3(args: Args) -> float:
-    """Frames per second of its DQN after the warm-up."""
+def stable_baselines3(args: Args, update_frequency: int, turns: Turns) -> None:
+    """Run its DQN; a frame is a call of its callback."""
     import ale_py
     import gymnasium as gym
     from stable_baselines3 import DQN
@@ -72,18 +88,34 @@ def stable_baselines3(args: Args) -> float:
 
     class Clock(BaseCallback):
         def _on_step(self) -> bool:
-            if self.num_timesteps == WARM_UP:
-                self.started = time.perf_counter()
+            turns.frame()
             return True
 
     gym.register_envs(ale_py)
     env = VecFrameStack(make_atari_env(args.env_id, n_envs=1, seed=1), n_stack=4)
     model = DQN("CnnPolicy", env, learning_rate=1e-4, buffer_size=WARM_UP + args.frames, learning_starts=1000,
-                batch_size=32, train_freq=args.update_frequency, gradient_steps=1, target_update_interval=1000,
+                batch_size=32, train_freq=update_frequency, gradient_steps=1, target_update_interval=1000,
                 exploration_fraction=1000 / (WARM_UP + args.frames), exploration_final_eps=0.01, seed=1)
-    clock = Clock()
-    model.learn(WARM_UP + args.frames, callback=clock)
-    return args.frames / (time.perf_counter() - clock.started)
+    model.learn(WARM_UP + args.frames, callback=Clock())
+
+
+def run(who, args: Args, update_frequency: int, mine, theirs, results) -> None:
+    """What each of the two processes does."""
+    turns = Turns(mine, theirs)
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
+        who(args, update_frequency, turns)
+    results.put((who.__name__, turns.seconds[: args.frames // TURN]))
+    for _ in range(100_000):
+        theirs.release()  # the other may finish without us
+
+
+def side_by_side(args: Args, update_frequency: int) -> dict[str, np.ndarray]:
+    """Seconds of every turn of each."""
+    processes = multiprocessing.get_context("spawn")
+    first, second, results = processes.Semaphore(1), processes.Semaphore(0), processes.Queue()
+    for who, mine, theirs in ((ours, first, second), (stable_baselines3, second, first)):
+        processes.Process(target=run, args=(who, args, update_frequency, mine, theirs, results), daemon=True).start()
+    return {name: np.array(seconds) for name, seconds in (results.get(timeout=3600) for _ in range(2))}
 
 
 def milliseconds(call, repeats: int = 300) -> float:
@@ -142,39 +174,21 @@ def parts(args: Args) -> dict[str, float]:
     }
 
 
-def measure(worker: str, update_frequency: int, args: Args):
-    """What one fresh process measures."""
-    done = subprocess.run([sys.executable, __file__, "--worker", worker, "--update-frequency", str(update_frequency),
-                           "--frames", str(args.frames), "--env-id", args.env_id], capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{worker} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 def main(args: Args) -> None:
-    """Measure in processes of their own, one after another, and print the two tables."""
-    workers = {"dqn_atari.py": ours, "Stable-Baselines3": stable_baselines3, "parts": parts}
-    if args.worker:
-        print(json.dumps(workers[args.worker](args)))
-        return
+    """Print where a frame's time goes, then the two side by side."""
     print(f"{args.env_id}, {os.cpu_count()} cores, {platform.machine()}, PyTorch {torch.__version__}, "
           f"{torch.get_num_threads()} threads")
-    times = measure("parts", 1, args)
-    print(f"\n{'milliseconds a frame':<38}{'update every frame':>20}{'update every 4th':>20}")
-    for name, value in times.items():
+    print(f"\n{'milliseconds a frame':<38}{'update every frame':>22}{'update every 4th':>22}")
+    for name, value in parts(args).items():
         rare = value / 4 if name.startswith(("sample", "update")) else value
-        print(f"{name:<38}{value:>20.2f}{rare:>20.2f}")
-    peers = ("dqn_atari.py", "Stable-Baselines3")
-    speeds = {(name, frequency): [] for name in peers for frequency in (1, 4)}
-    for _ in range(args.rounds):
-        for name, frequency in sorted(speeds, key=lambda key: key[1]):
-            speeds[name, frequency].append(measure(name, frequency, args))
-    ratios = {("ratio", frequency): np.divide(*(speeds[name, frequency] for name in peers)) for frequency in (1, 4)}
-    print(f"\n{f'frames a second, {args.rounds} rounds':<38}{'update every frame':>26}{'update every 4th':>26}")
-    for name, digits in ((peers[0], 1), (peers[1], 1), ("ratio", 2)):
-        columns = [(speeds | ratios)[name, frequency] for frequency in (1, 4)]
-        print(f"{name:<38}" + "".join(
-            f"{f'{np.median(x):.{digits}f} ({min(x):.{digits}f} to {max(x):.{digits}f})':>26}" for x in columns))
+        print(f"{name:<38}{value:>22.2f}{rare:>22.2f}", flush=True)
+    columns = [side_by_side(args, frequency) for frequency in (1, 4)]
+    print(f"\n{'frames a second':<38}{'update every frame':>22}{'update every 4th':>22}")
+    for name, title in (("ours", "dqn_atari.py"), ("stable_baselines3", "Stable-Baselines3")):
+        print(f"{title:<38}" + "".join(f"{TURN / column[name].mean():>22.1f}" for column in columns))
+    print(f"{'ratio':<38}" + "".join(f"{c['stable_baselines3'].sum() / c['ours'].sum():>22.2f}" for c in columns))
+    quarters = [np.quantile(column["stable_baselines3"] / column["ours"], (0.25, 0.75)) for column in columns]
+    print(f"{'  of turn and turn, middle half':<38}" + "".join(f"{f'{q[0]:.2f} to {q[1]:.2f}':>22}" for q in quarters))
 
 
 if __name__ == "__main__":

@@ -153,6 +153,18 @@ def test_video_holds_every_emulator_frame_in_order_and_colour(episode):
     assert np.sum(error[1:]) < np.sum(before) and np.sum(error[:-1]) < np.sum(after)
 
 
+def test_a_short_video_is_the_beginning_of_the_long_one(episode, network, tmp_path):
+    copied = shutil.copy(network, tmp_path / "q_network.pt")
+    play.main(play.Args(str(copied), epsilon=EPSILON, seed=SEED, video_seconds=1.51))
+    (folder,) = tmp_path.glob("play-*")
+    assert read_trace(folder) == episode.trace
+    short, long = (cv2.VideoCapture(str(path / "episode.webm")) for path in (folder, episode.folder))
+    images = list(iter(lambda: short.read()[1], None))
+    assert len(images) == 91  # 60 a second, and the begun one
+    for image in images:
+        assert np.abs(image.astype(float) - long.read()[1]).mean() < 4  # of 255: each is encoded anew
+
+
 def test_video_shows_score_lives_and_thoughts_at_their_frame(episode, monkeypatch):
     """The text that is drawn, emulator frame by emulator frame."""
     emulator = play.Recorder(play.make_emulator(BREAKOUT))
@@ -476,7 +488,8 @@ def test_what_is_no_network_is_refused_in_one_line(what, network, tmp_path, monk
 
 BAD_FLAGS = {
     "--epsilon 1.5": "between 0 and 1", "--epsilon nan": "between 0 and 1", "--epsilon -0.1": "between 0 and 1",
-    "--games 0": "--games must be at least 1", "--moments 0": "--moments must be at least 1",
+    "--games 0": "--games must be at least 1", "--video-seconds 0": "--video-seconds must be above 0",
+    "--video-seconds nan": "--video-seconds must be above 0", "--moments 0": "--moments must be at least 1",
     "--seed -1": "--seed must be at least 0", "--games many": "--games", "--no-such-flag 1": "--no-such-flag",
     "nowhere/q_network.pt": "there is no network nowhere", "runs/empty": "there is no network runs",
 }
