@@ -47,9 +47,9 @@ Deviations
     [8]: a state begins with empty frames   a state begins with copies of the      one rule for acting and replay; no
                                             episode's first frame                  frame that was never on the screen
     [8]: 1 to 30 no-ops                     0 to 30 no-ops, in emulator frames     §7.2.1: "maximum number"
-    32-bit arithmetic                       bfloat16 while training, on CPUs       twice as fast; the weights θ, the
-                                            that have it (--precision)             head, Adam, evaluation: 32-bit
-    raw frames, shared by reference         LZ4-compressed frames, by reference    0.3 to 1.4 GB instead of 11 GB
+    32-bit arithmetic                       bfloat16 while training, on CPUs       speed; the weights θ, the head, Adam
+                                            that have it (--precision)             and evaluation stay 32-bit
+    raw frames, shared by reference         LZ4-compressed frames, by reference    0.4 to 1.4 GB instead of 11 GB
     [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
     [8] released: θ⁻ copied every 10,000    Figure 18's 10,000 updates, 40,000     the lecture's table counts updates
     frames, area-averaged screens, ties     frames; bilinear screens; the first    §7.2.1 says bilinear; float ties
@@ -198,7 +198,7 @@ class Args:
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Where the network lives; auto takes an accelerator if PyTorch sees one."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Arithmetic while training; auto takes bfloat16 on a CPU that multiplies it, float32 elsewhere."""
+    """Arithmetic while training; auto takes bfloat16 on an x86 CPU that multiplies it, float32 elsewhere."""
     environment_test_frames: int = 135_000
     """Frames of the final test, in which only finished games count [§7.3.3]."""
     optimizer_gradient_momentum: float = 0.95
@@ -228,7 +228,8 @@ def fail(message: str) -> NoReturn:
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
     for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
+        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -540,7 +541,7 @@ class ReplayMemory:
         """The transitions at `indices` (B,), as `sample` returns them."""
         codes = [code for i in indices for code in self.frames[i]]
         frames = self.decode(codes).unflatten(0, (len(indices), -1))  # (B, 5, 84, 84) uint8: s the first 4, s' the last
-        columns = [torch.from_numpy(column[indices]).to(frames.device, non_blocking=True)
+        columns = [torch.from_numpy(column[indices]).to(frames.device)  # (B,) each
                    for column in (self.actions, self.rewards, self.terminals)]
         return frames[:, :-1], columns[0], columns[1], frames[:, 1:], columns[2]
 
@@ -555,10 +556,10 @@ def most_recent(replay: ReplayMemory, size: int) -> np.ndarray:
 
 class PixelConv2d(nn.Conv2d):
     """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
-    and less work."""
+    up to rounding, and less work."""
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return F.conv2d(pixels, self.weight / 255, self.bias, self.stride)
+        return self._conv_forward(pixels, self.weight / 255, self.bias)
 
 
 class QNetwork(nn.Module):
@@ -837,7 +838,7 @@ class Curves:
     @staticmethod
     def silence_full_disk(failure) -> None:
         """TensorBoard writes in a thread of its own: what the disk refuses it `attempt` says, not a traceback."""
-        if not issubclass(failure.exc_type, OSError):
+        if not (issubclass(failure.exc_type, OSError) and type(failure.thread).__name__ == "_AsyncWriterThread"):
             threading.__excepthook__(failure)
 
     def write(self, add) -> None:
@@ -935,7 +936,7 @@ def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tupl
     def number(codes: tuple, before: tuple, row: list[int]) -> list[int]:
         """The places of `codes` in `blobs`. Only neighbours share frames, so the transition before is all to look at:
         after (a, b, c, d, e) at [0, 1, 2, 3, 4] comes (b, c, d, e, f) at [1, 2, 3, 4, 5], and only f is added; a new
-        episode (g, g, g, g, h) shares nothing and is at [6, 6, 6, 6, 7]."""
+        episode (g, g, g, g, h) is at [6, 6, 6, 6, 7]."""
         if row and all(map(operator.is_, codes, before[1:])):
             return [*row[1:], *map(add, codes[len(before) - 1 :])]
         places = {key: add(code) for key, code in {id(code): code for code in codes}.items()}
@@ -1506,6 +1507,9 @@ def main(args: Args) -> None:
             state = restore_run(saved, list(codes), replay, env, generators, learnt)
         except ValueError as error:
             fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
+        before = saved["target_network"]["layers.conv1.weight"].dtype
+        if before != precision:
+            print(f"note     trained in {before} so far, from here in {precision}: see --precision", flush=True)
         working_network.load_state_dict(q_network.state_dict())
         del saved, blobs
     else:
@@ -1671,7 +1675,9 @@ def main(args: Args) -> None:
         print(f"error: stopped at frame {counters.frames:,}, which {run_dir} could not keep", file=sys.stderr)
         raise SystemExit(1)
     if stop.signum:
-        print(f"stopped at frame {counters.frames:,}; go on with: {sys.executable} {sys.argv[0]} --resume {run_dir}")
+        command = [sys.executable, sys.argv[0], "--resume", str(run_dir)]
+        shell_line = shlex.join(command) if os.name == "posix" else subprocess.list2cmdline(command)
+        print(f"stopped at frame {counters.frames:,}; go on with: {shell_line}")
         raise SystemExit(128 + stop.signum)
 
     count_seconds()
@@ -1680,6 +1686,7 @@ def main(args: Args) -> None:
     attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
         "scores": [score for score, _ in finished], "lengths": [length for _, length in finished],
         "seed": args.seed, "env_id": args.env_id, "device": f"{device}, {platform.machine()}, {os.cpu_count()} cores",
+        "precision": str(precision).removeprefix("torch."), "threads": torch.get_num_threads(),
         "versions": {"python": platform.python_version()} | {module.__name__: module.__version__ for module in modules},
         "peak_memory_bytes": counters.peak_memory, "args": vars(args)}))
     if not finished:

@@ -64,7 +64,6 @@ import lz4.block
 import matplotlib
 import numpy as np
 import torch
-import torch.nn.functional as F
 import tyro
 from matplotlib.figure import Figure
 from torch import nn
@@ -113,7 +112,8 @@ def fail(message: str) -> NoReturn:
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
     for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
+        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -374,10 +374,10 @@ def decode_screen(code: bytes) -> np.ndarray:
 
 class PixelConv2d(nn.Conv2d):
     """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
-    and less work."""
+    up to rounding, and less work."""
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return F.conv2d(pixels, self.weight / 255, self.bias, self.stride)
+        return self._conv_forward(pixels, self.weight / 255, self.bias)
 
 
 class QNetwork(nn.Module):

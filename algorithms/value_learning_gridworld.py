@@ -115,7 +115,8 @@ def fail(message: str) -> NoReturn:
 def parse_args(args_class: type[Flags]) -> Flags:
     """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
     for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(encoding="utf-8")  # a Windows console or pipe may not know π
+        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):

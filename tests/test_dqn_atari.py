@@ -351,6 +351,25 @@ def test_truncation_bootstraps_and_a_lost_life_does_not(train, monkeypatch):
     assert memory.terminals.sum() == len(ends) - len(truncated) > 3
 
 
+def test_training_acts_in_lower_precision_and_evaluation_in_float32(train, monkeypatch):
+    act, evaluate, evaluating, seen = dqn.greedy_action, dqn.evaluate, [], {True: set(), False: set()}
+
+    def spy(network, state):
+        seen[bool(evaluating)].add(network.layers.conv1.weight.dtype)
+        return act(network, state)
+
+    def spied_evaluate(*arguments, **limit):
+        evaluating.append(True)
+        finished = evaluate(*arguments, **limit)
+        evaluating.pop()
+        return finished
+
+    monkeypatch.setattr(dqn, "greedy_action", spy)
+    monkeypatch.setattr(dqn, "evaluate", spied_evaluate)
+    train(precision="bfloat16", agent_epsilon_greedy_epsilon_initial=0.5)
+    assert seen == {True: {torch.float32}, False: {torch.bfloat16}}
+
+
 # ---- the network -----------------------------------------------------------------------------------
 
 

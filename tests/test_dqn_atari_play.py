@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import json
 import os
 import pickle
 import re
@@ -17,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 from gymnasium.wrappers import TimeLimit
 
 BREAKOUT, SEED, EPSILON = "BreakoutNoFrameskip-v4", 2, 0.8  # an untrained agent that seldom presses FIRE plays for ever
@@ -519,3 +521,35 @@ def test_help_names_every_flag(monkeypatch, capsys):
     text = capsys.readouterr().out
     for flag in ("--games", "--epsilon", "--seed", "--moments", "--show-layers", "--runs-dir", "[NETWORK]"):
         assert flag in text
+
+
+# ---- the published agent ---------------------------------------------------------------------------
+
+PUBLISHED = ROOT / "runs" / "published" / "pong"
+
+
+def test_the_published_agent_plays_pong(tmp_path, capsys):
+    """One whole game at ε = 0.05, seed 1."""
+    copied = shutil.copy(PUBLISHED / "q_network.pt", tmp_path / "q_network.pt")
+    play.main(play.Args(str(copied), video_seconds=1.0))
+    assert float(re.search(r"game 1   score (-?\d+)", capsys.readouterr().out)[1]) >= 15
+
+
+def test_without_any_run_the_published_agent_is_found(tmp_path):
+    assert play.find_network(play.Args(runs_dir=str(tmp_path / "none"))) == PUBLISHED / "q_network.pt"
+
+
+def test_readme_says_what_the_published_run_measured():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    test = json.loads((PUBLISHED / "test.json").read_text())
+    assert test["score_mean"] == pytest.approx(np.mean(test["scores"])) and sum(test["lengths"]) <= 135_000
+    for words in (f"{test['score_mean']:.2f}", f"{test['frames']:,} frames", f"{test['updates']:,} updates",
+                  f"{len(test['scores'])} games"):
+        assert words in readme
+    args = json.loads((PUBLISHED / "args.json").read_text())
+    default = vars(dqn.Args())
+    for name, value in args.items():
+        if value != default[name]:
+            assert f"{dqn.flag(name)} {value} " in " ".join(readme.replace("\\", " ").split())
+    events = sum(path.stat().st_size for path in PUBLISHED.glob("events*"))
+    assert 0 < events < 5e6 and (PUBLISHED / "q_network.pt").stat().st_size <= 7e6
