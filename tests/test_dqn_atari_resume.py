@@ -23,9 +23,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 FRAMES = 500
 SHORT = dict(precision="bfloat16", environment_train_frames_max=FRAMES, agent_replay_buffer_initial=150,
-             optimizer_minibatch_size=8, agent_update_frequency=4, environment_test_frames=150, environment_evaluation_interval_episodes=4,
-             environment_evaluation_episodes=1, environment_checkpoint_interval_episodes=2,
-             optimizer_q_network_parameter_update_interval_frames=70)
+             optimizer_minibatch_size=8, agent_update_frequency=4, environment_test_frames=150,
+             environment_evaluation_interval_episodes=4, environment_evaluation_episodes=1,
+             environment_checkpoint_interval_episodes=2, optimizer_q_network_parameter_update_interval_frames=70)
 CAP = {"BreakoutNoFrameskip-v4": 108_000, "PongNoFrameskip-v4": 400}  # Pong: an episode every 100 frames
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, SIGKILL and file-size limits")
 
