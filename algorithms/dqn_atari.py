@@ -5,7 +5,7 @@
 #     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
-"""Deep Q-Learning on Atari games: Algorithm 6 of the lecture (ECE 544NA, Lecture 27, §5.3 and §7), the method of
+r"""Deep Q-Learning on Atari games: Algorithm 6 of the lecture (ECE 544NA, Lecture 27, §5.3 and §7), the method of
 Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), [8] below.
 
 Run it
@@ -15,21 +15,21 @@ Run it
     tensorboard --logdir runs                                           # watch it learn
 
 The column of the Nature paper (Figure 18; 50 million frames):
-    python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 50000000 \\
-        --optimizer-name RMSprop --optimizer-learning-rate 0.00025 --agent-update-frequency 4 \\
-        --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \\
+    python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 50000000 \
+        --optimizer-name RMSprop --optimizer-learning-rate 0.00025 --agent-update-frequency 4 \
+        --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \
         --optimizer-q-network-parameter-update-interval-frames 40000
 
 How to read it
-    The loop in `main` is Algorithm 6, line by line, and `update` its lines 19 to 22; then `ReplayMemory`, `QNetwork`
+    The loop in `main` is Algorithm 6, line by line, and `update` its lines 20 to 22; then `ReplayMemory`, `QNetwork`
     and the wrappers. "report and checkpoint" is what keeps hours of work safe: it can wait.
 
 Measured
     Pong, seed 1, two CPU cores, PyTorch 2.13: 710,000 frames and 350,001 updates in 2 hours and 23 minutes:
-        python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 710000 \\
-            --agent-update-frequency 2 --agent-discount-factor 0.98 --agent-epsilon-greedy-epsilon-final 0.02 \\
-            --agent-epsilon-greedy-annealing 50000 --agent-replay-buffer-initial 10000 \\
-            --agent-replay-buffer-maximum-length 400000 --environment-evaluation-interval-episodes 50 \\
+        python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4 --environment-train-frames-max 710000 \
+            --agent-update-frequency 2 --agent-discount-factor 0.98 --agent-epsilon-greedy-epsilon-final 0.02 \
+            --agent-epsilon-greedy-annealing 50000 --agent-replay-buffer-initial 10000 \
+            --agent-replay-buffer-maximum-length 400000 --environment-evaluation-interval-episodes 50 \
             --environment-checkpoint-interval-episodes 50
     The final test, 36 games in 135,000 frames: mean score 11.81, variance 37.49. Evaluations on the way,
     ten games each: -20.8 at frame 45,292, -17.0 at frame 132,081, -0.9 at frame 397,605, -1.7 at frame 647,269.
@@ -38,8 +38,8 @@ Measured
 Deviations
     lecture or paper                        this file                              why
     --------------------------------------  -------------------------------------  ------------------------------------
-    Algorithm 6 copies θ to θ⁻ at every     every 1,000 frames                     Table 3 says so; the two disagree
-    evaluation
+    Algorithm 6 copies θ to θ⁻ by episodes  every 1,000 frames, every 500          Table 3 says so; the two disagree
+    and evaluates by frames                 episodes
     squared error (Algorithm 6, line 22)    Huber loss                             §5.3: [8] clips the error's gradient;
                                                                                    so does this file
     [8] acts at random until learning       ε is annealed from the first frame     Algorithm 6, lines 10-13
@@ -245,7 +245,7 @@ def check_args(args: Args) -> None:
 #   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12      60 a second
 #   action           a₁ ────────  a₂ ────────  a₃ ───────    repeated 4 times, rewards summed
 #   max-pool               3∨4         7∨8       11∨12       of the last two: some sprites are drawn every other frame
-#   frame                   x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
+#   frame          x₀       x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
 #   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
 
 
@@ -333,7 +333,6 @@ class Downsample(gym.ObservationWrapper):
     def __init__(self, env: gym.Env, height: int, width: int):
         super().__init__(env)
         self.height, self.width = height, width
-        self.observation_space = gym.spaces.Box(0, 255, (height, width), np.uint8)
 
     def observation(self, screen: np.ndarray) -> np.ndarray:
         return cv2.resize(screen, (self.width, self.height), interpolation=cv2.INTER_LINEAR)  # (84, 84) uint8
@@ -410,7 +409,7 @@ def make_emulator(env_id: str) -> gym.Env:
 
 
 def preprocess(env: gym.Env, args: Args, encode, rng: np.random.Generator, training: bool) -> gym.Env:
-    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the two ifs)."""
+    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the `if`)."""
     env = JoystickActions(env)
     env = NoOpReset(env, args.environment_no_op_max, rng)
     env = MaxPool(env, args.environment_frames_to_maxpool)
@@ -451,7 +450,8 @@ def to_bytes(code) -> bytes:
     """An encoded frame as LZ4 bytes, for a checkpoint."""
     if isinstance(code, bytes):
         return code
-    return lz4.block.compress(np.asarray(code.cpu() if torch.is_tensor(code) else code), store_size=False)
+    frame = code.cpu().numpy() if torch.is_tensor(code) else code
+    return lz4.block.compress(frame, store_size=False)
 
 
 def from_bytes(blob: bytes, encoding_name: str, shape: tuple[int, int], encode) -> object:
@@ -546,7 +546,7 @@ def working_copy(q_network: QNetwork, precision: torch.dtype) -> QNetwork:
     working_network = copy.deepcopy(q_network)
     working_network.layers.to(precision)
     for θ in q_network.parameters():
-        θ.grad = torch.zeros_like(θ)  # made once and filled by `update`: made anew, its pages cost up to 5 % of a frame
+        θ.grad = torch.zeros_like(θ)  # `update` copies into it; 7 MB allocated anew cost up to 5 % of a frame
     return working_network
 
 
@@ -570,7 +570,8 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇        n ← 0.95 n + 0.05 ∇²        θ ← θ - lr ∇ / √(n - g² + 0.01)
                 state["g"].lerp_(θ.grad, 1 - group["mean_decay"])
                 state["n"].lerp_(θ.grad.square(), 1 - group["square_decay"])
-                root = (state["n"] - state["g"].square() + group["constant"]).sqrt()
+                variance = (state["n"] - state["g"].square()).clamp_min(0)  # below 0 only if the two decays differ
+                root = (variance + group["constant"]).sqrt()
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 
@@ -593,15 +594,15 @@ def epsilon_at(frame: int, args: Args) -> float:
 @torch.inference_mode()
 def greedy_action(q_network: QNetwork, state: torch.Tensor) -> int:
     """π(s) = argmax_a Q(s, a; θ) (Equation 35) of one state (4, 84, 84) uint8."""
-    # an accelerator is waited for here, and when a point of the curves is logged
+    # waits for an accelerator; so do the points of the curves, and a frame or minibatch that is copied to it
     return q_network(state.unsqueeze(0)).argmax(dim=1).item()
 
 
 def update(q_network: QNetwork, working_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer,
            minibatch: tuple, discount: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """One optimization iteration (Algorithm 6, lines 19-22). The optimizer moves θ, the float32 weights of `q_network`;
-    the arithmetic is done by its copy `working_network`, in lower precision or the same network. Returns the
-    minibatch's mean Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
+    """One optimization iteration (Algorithm 6, lines 20-22). The optimizer moves θ, the float32 weights of `q_network`;
+    the arithmetic is done by its `working_copy`, in lower precision or the same network. Returns the minibatch's mean
+    Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
     s, a, r, s_next, terminal = minibatch
 
     # y_j = r_j                                      if s_{j+1} is terminal
@@ -636,7 +637,7 @@ def update(q_network: QNetwork, working_network: QNetwork, target_network: QNetw
 def diagnose(q_network: QNetwork, states: torch.Tensor) -> dict[str, float]:
     """How alive the network is on a minibatch of states (B, 4, 84, 84): of every layer the share of its units (filters)
     that are 0 in every state, and the standard deviation of Q over the states, mean over actions. If a whole layer is
-    dead, Q is the same in every state and no gradient passes: nothing will ever be learnt."""
+    dead, Q is the same in all of them and no gradient passes to the layers below."""
     scalars = {}
     x = states.float()  # (B, 4, 84, 84)
     for name, layer in q_network.layers.named_children():
@@ -655,8 +656,9 @@ def evaluate(args: Args, q_network: QNetwork, encoding: tuple, number: int, stop
              frames: int | None = None) -> list[tuple[float, int]] | None:
     """Play whole games at ε_evaluation for raw reward until `games` are finished or `frames` have passed; an unfinished
     game does not count. It depends on the network, the seed and its own `number` alone. Returns (score, length in
-    frames) per game, or None if it was stopped."""
+    frames) per game, or None if it was stopped. Number 0 is the final test."""
     encode, decode = encoding
+    # + 1, for SeedSequence([seed, 0]) is SeedSequence(seed): the final test would draw what training drew
     exploration, no_ops = (np.random.default_rng(s) for s in np.random.SeedSequence([args.seed, number + 1]).spawn(2))
     env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=False)
     finished, score, length = [], 0.0, 0
@@ -699,7 +701,7 @@ class Counters:
     recent_scores: list[float] = dataclasses.field(default_factory=list)  # of the last 20 games
     evaluation_rows: list[dict] = dataclasses.field(default_factory=list)  # of evaluations.csv
     seconds: float = 0.0  # of wall-clock, evaluations included, pauses between resumes not
-    peak_memory: int = 0  # bytes resident
+    peak_memory: int = 0  # bytes resident, the most seen at a point of the curves or before a checkpoint
 
 
 def evaluation_row(counters: Counters, finished: list[tuple[float, int]]) -> dict:
@@ -728,7 +730,7 @@ class Stop:
 
 
 def bar_style() -> dict:
-    """tqdm's settings: a live bar in a terminal, a line a minute in a log."""
+    """tqdm's settings: a live bar in a terminal, an update a minute in a log."""
     return dict(mininterval=0.5 if sys.stderr.isatty() else 60, dynamic_ncols=True, smoothing=0.05)
 
 
@@ -739,7 +741,7 @@ def attempt(what: str, write) -> bool:
         return True
     except OSError as error:
         reason = error.strerror or error
-        tqdm.write(f"warning: {what} could not be written ({reason}); training goes on", file=sys.stderr)
+        tqdm.write(f"warning: {what} could not be written ({reason}); the run goes on", file=sys.stderr)
         return False
 
 
@@ -831,7 +833,7 @@ def environment_state(env: gym.Env) -> dict:
 
 def restore_environment(env: gym.Env, state: dict, history: tuple) -> None:
     """Put `env` where `environment_state` was taken."""
-    env.reset()
+    env.reset()  # Gymnasium wants one before the first step; what it draws is overwritten with the generators
     env.unwrapped.ale.restoreState(ale_py.ALEState(state["emulator"]))
     wrapper(env, LifeLoss).lives = state["lives"]
     wrapper(env, MaxPool).screens.clear()
@@ -841,8 +843,8 @@ def restore_environment(env: gym.Env, state: dict, history: tuple) -> None:
 
 def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tuple) -> None:
     """One file that torch.load(weights_only=True) reads, with the encoded frames, each once, as one more member of
-    PyTorch's zip archive: they are streamed, so a million of them need no second copy in memory, and the archive's
-    CRC-32 guards every member. Raises OSError."""
+    PyTorch's zip archive: they are streamed, so a million of them, LZ4 as they are, need no second copy in memory, and
+    the archive's CRC-32 guards every member. Raises OSError."""
     blobs = []
 
     def add(code) -> int:
@@ -898,11 +900,12 @@ def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
         raise ValueError(f"{path} cannot be resumed from: {reason}") from None
 
 
-def restore_run(saved: dict, codes: list, replay: ReplayMemory, env: gym.Env, generators: list, learnt: dict) -> tuple:
-    """Put everything where the checkpoint was taken; `codes` are its frames, encoded for `replay`. Returns the state.
-    Raises ValueError, with the part's name, for a part that does not fit."""
+def restore_run(saved: dict, codes, replay: ReplayMemory, env: gym.Env, generators: list, learnt: dict) -> tuple:
+    """Put everything where the checkpoint was taken; `codes` yields its frames, encoded for `replay`. Returns the
+    state. Raises ValueError, with the part's name, for a part that does not fit."""
     part = "replay"
     try:
+        codes = list(codes)
         columns = {name: column.numpy() for name, column in saved["replay"].items()}
         replay.added = saved["added"]
         for i, row in enumerate(columns["indices"].tolist()):
@@ -975,7 +978,8 @@ def gigabytes(count: float) -> str:
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes that are free on an NVIDIA GPU, or on the machine for whatever shares its memory."""
+    """Bytes that are free on an NVIDIA GPU, or on the machine for whatever shares its memory; a container's or a
+    cluster's own limit is not known here."""
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
 
 
@@ -1000,12 +1004,14 @@ def choose_encoding(args: Args, device: torch.device) -> tuple[str, float]:
     cpu = torch.device("cpu")
     transitions = min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max)
     pixels = args.environment_state_height * args.environment_state_width
+    # frame_bytes in any case: it refuses an env_id that cannot be played before a run directory is made
     frame = {"lz4": frame_bytes(args), "raw": sys.getsizeof(np.empty(pixels, np.uint8)), "tensor": float(pixels)}
     name = args.replay_encoding
     if name == "auto":
         fits = device.type != "cpu" and transitions * frame["tensor"] < 0.8 * free_memory(device)
         name = "tensor" if fits else "lz4"
-    references = sys.getsizeof((None,) * (args.agent_history_length + 1)) + 16 + 8 + 8 + 4 + 1  # tuple, list, a, r, end
+    references = sys.getsizeof((None,) * (args.agent_history_length + 1)) + 16 + 8  # tuple, allocator, list
+    references += 8 + 4 + 1  # a, r, terminal
     need, free = transitions * (frame[name] + references), free_memory(device if name == "tensor" else cpu)
     if need > free:
         raise ValueError(f"a replay memory of {transitions:,} transitions needs {gigabytes(need)}, {gigabytes(free)} "
@@ -1030,11 +1036,10 @@ def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind."""
     stop, resumed, saved = Stop(), args.resume, None
     try:
-        check_args(args)
         if resumed:
             run_dir, _lock = open_run(args, "")
             args = resumed_args(Args, run_dir)
-            check_args(args)
+        check_args(args)
         device, precision = choose_device(args)
         encoding_name, replay_bytes = choose_encoding(args, device)
         if resumed:
@@ -1073,7 +1078,7 @@ def main(args: Args) -> None:
         learnt = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
         codes = (from_bytes(blob, encoding_name, shape, encode) for blob in blobs)
         try:
-            state = restore_run(saved, list(codes), replay, env, generators, learnt)
+            state = restore_run(saved, codes, replay, env, generators, learnt)
         except ValueError as error:
             fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
         before = saved["target_network"]["layers.conv1.weight"].dtype
@@ -1104,9 +1109,8 @@ def main(args: Args) -> None:
     curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
     curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
     process, dead, loss = psutil.Process(), set(), None
-    log_interval = math.ceil(LOG_INTERVAL / args.agent_update_frequency) * args.agent_update_frequency  # of updates too
-    clock = checkpoint_time = window_time = time.monotonic()
-    window = dataclasses.replace(counters)  # the counters when `window_time` began
+    log_interval = math.ceil(LOG_INTERVAL / args.agent_update_frequency) * args.agent_update_frequency
+    clock = checkpoint_time = time.monotonic()
 
     def stop_if_not_finite() -> None:
         """A NaN never leaves the weights again: end the run before one reaches a checkpoint."""
@@ -1121,6 +1125,9 @@ def main(args: Args) -> None:
         nonlocal clock
         counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
 
+    def now() -> tuple[float, int, int]:
+        return time.monotonic(), counters.frames, counters.updates
+
     def checkpoint() -> bool:
         """Write q_network.pt, all that is needed to play, and checkpoint.pt, all that is needed to go on."""
         stop_if_not_finite()
@@ -1133,14 +1140,17 @@ def main(args: Args) -> None:
             "target_network": target_network.state_dict(), "optimizer": optimizer.state_dict(),
             "counters": dataclasses.asdict(counters), "environment": environment_state(env),
             "generators": [generator.bit_generator.state for generator in generators]}
-        attempt("q_network.pt", lambda: write_atomically(run_dir / "q_network.pt", lambda f: save_tensors(weights, f)))
-        return attempt("checkpoint.pt", lambda: save_checkpoint(run_dir / "checkpoint.pt", everything, replay, state))
+        playable = attempt("q_network.pt", lambda: write_atomically(
+            run_dir / "q_network.pt", lambda file: save_tensors(weights, file)))
+        return playable & attempt("checkpoint.pt", lambda: save_checkpoint(
+            run_dir / "checkpoint.pt", everything, replay, state))
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
                bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]", **bar_style())
 
     # 5-7 are `counters`; ε is a function of the frame. Evaluation stands first, so that one that was cut off is done
     # again when the run is resumed.
+    window = now()  # where the stretch began whose frames and updates a second are shown; no evaluation is part of it
     # 8  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max:
         # 27-29  Evaluate the agent.
@@ -1160,6 +1170,7 @@ def main(args: Args) -> None:
                            f"update {counters.updates:,}, episode {counters.episodes:,}: "
                            f"score {row['score_mean']:.2f} (variance {row['score_variance']:.4g}), "
                            f"length {row['length_mean']:.1f} frames")
+            window = now()
         if stop.signum:
             break
         if (counters.episodes - counters.checkpoint_episodes >= args.environment_checkpoint_interval_episodes
@@ -1167,6 +1178,7 @@ def main(args: Args) -> None:
             counters.checkpoint_episodes = counters.episodes
             checkpoint()
             checkpoint_time = time.monotonic()
+            window = now()
 
         # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q_θ(s, a); reduce ε; add (s, a, r, s') to 𝒟.
         epsilon = epsilon_at(counters.frames, args)
@@ -1207,25 +1219,25 @@ def main(args: Args) -> None:
         bar.update()
         if counters.frames % log_interval == 0:
             stop_if_not_finite()
-            seconds = time.monotonic() - window_time
-            frames_per_second = (counters.frames - window.frames) / seconds
-            updates_per_second = (counters.updates - window.updates) / seconds
-            window_time, window = time.monotonic(), dataclasses.replace(counters)
-            scalars = {"charts/epsilon": epsilon, "charts/frames_per_second": frames_per_second}
+            seconds, frames, updates = map(operator.sub, now(), window)
+            window = now()
+            scalars = {"charts/epsilon": epsilon, "charts/frames_per_second": frames / seconds}
             if loss is not None:
                 scalars |= {"losses/huber": loss.item(), "losses/q_values": q.mean().item()}
                 scalars |= diagnose(q_network, minibatch[0])
             curves.add(scalars, counters.frames)
             now_dead = {name for name, share in scalars.items() if "dead_units" in name and share == 1}
             for name in sorted(now_dead - dead):
-                tqdm.write(f"warning: frame {counters.frames:,}: {name} is 1, Q is the same in every state and nothing "
-                           "more will be learnt; start again with a lower --optimizer-learning-rate", file=sys.stderr)
+                tqdm.write(f"warning: frame {counters.frames:,}: {name} is 1: Q is the same in every state, the "
+                           "layers below learn no more; start again with a lower --optimizer-learning-rate",
+                           file=sys.stderr)
             dead = now_dead
             counters.peak_memory = max(counters.peak_memory, process.memory_info().rss)
             score = f"{np.mean(counters.recent_scores):.1f}" if counters.recent_scores else "none yet"
-            bar.set_postfix_str(f"{frames_per_second:.0f} frames/s, {updates_per_second:.0f} updates/s, "
+            bar.set_postfix_str(f"{frames / seconds:.0f} frames/s, {updates / seconds:.0f} updates/s, "
                                 f"ε {epsilon:.3f}, score {score}", refresh=False)
 
+    # 32  return θ
     bar.close()
     saved_at_the_end = checkpoint()
     if not stop.signum:
@@ -1243,7 +1255,7 @@ def main(args: Args) -> None:
     count_seconds()
     result = evaluation_row(counters, finished)
     modules = (torch, np, gym, ale_py, cv2)
-    attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
+    saved_at_the_end &= attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
         "scores": [score for score, _ in finished], "lengths": [length for _, length in finished],
         "seed": args.seed, "env_id": args.env_id, "device": f"{device}, {platform.machine()}, {os.cpu_count()} cores",
         "precision": str(precision).removeprefix("torch."), "threads": torch.get_num_threads(),

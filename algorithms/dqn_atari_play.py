@@ -140,7 +140,7 @@ def check_flags(args: Args) -> None:
 #   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12      60 a second, each in the video
 #   action           a₁ ────────  a₂ ────────  a₃ ───────    repeated 4 times, rewards summed
 #   max-pool               3∨4         7∨8       11∨12       of the last two: the coloured screens of moments.png
-#   frame                   x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
+#   frame          x₀       x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
 #   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
 
 
@@ -249,7 +249,6 @@ class Downsample(gym.ObservationWrapper):
     def __init__(self, env: gym.Env, height: int, width: int):
         super().__init__(env)
         self.height, self.width = height, width
-        self.observation_space = gym.spaces.Box(0, 255, (height, width), np.uint8)
 
     def observation(self, screen: np.ndarray) -> np.ndarray:
         return cv2.resize(screen, (self.width, self.height), interpolation=cv2.INTER_LINEAR)  # (84, 84) uint8
@@ -326,7 +325,7 @@ def make_emulator(env_id: str) -> gym.Env:
 
 
 def preprocess(env: gym.Env, args: Args, encode, rng: np.random.Generator, training: bool) -> gym.Env:
-    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the two ifs)."""
+    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the `if`)."""
     env = JoystickActions(env)
     env = NoOpReset(env, args.environment_no_op_max, rng)
     env = MaxPool(env, args.environment_frames_to_maxpool)
@@ -542,7 +541,7 @@ def largest_jumps(values: np.ndarray, count: int) -> list[int]:
 
 
 def bar_style() -> dict:
-    """tqdm's settings: a live bar in a terminal, a line a minute in a log."""
+    """tqdm's settings: a live bar in a terminal, an update a minute in a log."""
     return dict(mininterval=0.5 if sys.stderr.isatty() else 60, dynamic_ncols=True, smoothing=0.05)
 
 

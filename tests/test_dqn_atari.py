@@ -478,6 +478,18 @@ def test_rmsprop_against_a_trace_by_hand():
         assert module.weight.item() == pytest.approx(expected, abs=1e-14)
 
 
+@pytest.mark.parametrize("decays", [(0.0, 0.95), (0.95, 1.0)])
+def test_rmsprop_stays_finite_with_unequal_decays(decays):
+    module = nn.Linear(1, 1, bias=False)
+    args = dqn.Args(optimizer_name="RMSprop", optimizer_gradient_momentum=decays[0],
+                    optimizer_squared_gradient_momentum=decays[1])
+    optimizer = dqn.make_optimizer(args, module)
+    for _ in range(3):
+        module.weight.grad = torch.ones(1, 1)
+        optimizer.step()
+    assert module.weight.isfinite().all()  # n - g² is negative here
+
+
 def test_optimizers_differ_and_both_learn(train):
     runs = [train(optimizer_name=name)[0] for name in ("Adam", "RMSprop")]
     assert not same(weights(runs[0]), weights(runs[1]))

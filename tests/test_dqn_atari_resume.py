@@ -282,7 +282,7 @@ def test_a_full_disk_loses_nothing_and_training_goes_on(tmp_path):
     _, status = os.waitpid(in_a_child(folder, limit=10_000_000, resume=run_dir), 0)
     log = (tmp_path / "child.log").read_text()
     assert os.WEXITSTATUS(status) == 1, log  # the last frames could not be kept, and that is said
-    assert log.count("warning: checkpoint.pt could not be written (File too large); training goes on") > 1
+    assert log.count("warning: checkpoint.pt could not be written (File too large); the run goes on") > 1
     assert (run_dir / "checkpoint.pt").read_bytes() == before
     assert (run_dir / "test.json").exists() and not list(run_dir.glob("*.tmp"))
     (run_dir / "test.json").unlink()
@@ -290,8 +290,22 @@ def test_a_full_disk_loses_nothing_and_training_goes_on(tmp_path):
     assert dqn.load_checkpoint(run_dir / "checkpoint.pt")[0]["counters"]["frames"] == FRAMES
 
 
+@pytest.mark.parametrize("lost", ["q_network.pt", "test.json"])
+def test_a_result_that_could_not_be_kept_is_a_failure(tmp_path, capsys, monkeypatch, lost):
+    write = dqn.write_atomically
+
+    def refuse(path, content):
+        if path.name == lost:
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(dqn, "write_atomically", refuse)
+    assert run(tmp_path, environment_train_frames_max=160)[0] == 1
+    assert f"warning: {lost} could not be written (No space left on device)" in capsys.readouterr().err
+
+
 def test_curves_that_cannot_be_written_do_not_end_the_run(tmp_path, capsys, monkeypatch):
-    line = "warning: a point of the curves could not be written (No space left on device); training goes on\n"
+    line = "warning: a point of the curves could not be written (No space left on device); the run goes on\n"
     curves = dqn.Curves(tmp_path, 0)
 
     def refuse(*_, **__):
@@ -325,7 +339,7 @@ for frame in range(200):
     time.sleep(0.005)
 """
     done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=ALGORITHMS, capture_output=True, text=True)
-    line = "warning: a point of the curves could not be written (File too large); training goes on"
+    line = "warning: a point of the curves could not be written (File too large); the run goes on"
     assert done.returncode == 0 and set(done.stderr.splitlines()) == {line}, done.stderr
 
 
@@ -394,6 +408,12 @@ def test_a_contradiction_equal_to_the_default_is_seen(tmp_path, capsys):
     _, run_dir = run(tmp_path, before_frame=stop_at(20), seed=5)
     line = refused(run_dir, capsys, "--seed", "1")
     assert "--seed 1" in line and "5" in line
+
+
+def test_a_flag_that_agrees_with_the_run_is_welcome(tmp_path):
+    flags = dict(agent_replay_buffer_maximum_length=160)  # below Table 3's initial 100,000, above this run's own
+    _, run_dir = run(tmp_path, before_frame=stop_at(20), **flags)
+    assert run(tmp_path, resume=run_dir, **flags)[0] == 0
 
 
 def test_a_finished_run_says_so(tmp_path, capsys):
