@@ -219,7 +219,7 @@ def flag(name: str) -> str:
 
 def check_args(args: Args) -> None:
     """Raise ValueError, with the flag's name, for a value that no run can use."""
-    numbers = {name: value for name, value in vars(args).items() if not isinstance(value, str)}
+    numbers = {name: value for name, value in vars(args).items() if type(value) in (int, float)}
     for name, value in numbers.items():
         if "epsilon_greedy_epsilon" in name or "momentum" in name or name == "agent_discount_factor":
             good, demand = 0 <= value <= 1, "lie between 0 and 1"
@@ -716,7 +716,8 @@ def evaluation_row(counters: Counters, finished: list[tuple[float, int]]) -> dic
 
 
 class Stop:
-    """SIGINT or SIGTERM asks the loop to end at the next frame; a second one ends the process at once."""
+    """SIGINT or SIGTERM asks the loop to end at the next frame; a second SIGINT (Ctrl-C) ends the process at once. A
+    second SIGTERM does not: whoever stops a group of processes may send more than one."""
 
     def __init__(self):
         self.signum = 0
@@ -725,8 +726,8 @@ class Stop:
 
     def __call__(self, signum: int, _frame) -> None:
         self.signum = signum
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def bar_style() -> dict:

@@ -17,7 +17,7 @@ runs and tabulates its arms.
                                              order (Table 6). The lecture does not say how it did this. Everything else
                                              is unchanged: the random frames before learning starts, the update
                                              frequency, the minibatch's size
-With none of the three a run is bit for bit that of dqn_atari.py.
+With none of the three a run is bit for bit that of dqn_atari.py with the same --env-id.
 
 Run it
     python algorithms/dqn_atari_ablation.py --no-target-network                     # one arm; Breakout, Table 3
@@ -214,7 +214,7 @@ class Args:
     """Minutes after which a checkpoint is written even if no interval of episodes has passed."""
     resume: str = ""
     """A run directory to go on with; its own flags hold, only --environment-train-frames-max may be raised. auto: the
-    newest run with these very flags in --runs-dir, or a new one if there is none."""
+    run with these very flags in --runs-dir, or a new one if there is none."""
     runs_dir: str = "runs"
     """Folder that the run directory is made in."""
 
@@ -248,7 +248,7 @@ def flag(name: str) -> str:
 
 def check_args(args: Args) -> None:
     """Raise ValueError, with the flag's name, for a value that no run can use."""
-    numbers = {name: value for name, value in vars(args).items() if not isinstance(value, str)}
+    numbers = {name: value for name, value in vars(args).items() if type(value) in (int, float)}
     for name, value in numbers.items():
         if "epsilon_greedy_epsilon" in name or "momentum" in name or name == "agent_discount_factor":
             good, demand = 0 <= value <= 1, "lie between 0 and 1"
@@ -271,8 +271,7 @@ def check_args(args: Args) -> None:
 
 def check_ablation_args(args: Args) -> None:
     """check_args, and this script's own. Raises ValueError."""
-    switches = {name: True for name, value in vars(args).items() if isinstance(value, bool)}
-    check_args(dataclasses.replace(args, **switches))  # a switch is no number that could be too small
+    check_args(args)
     for name, needed in (("seeds", "study"), ("list", "study"), ("markdown", "table"), ("figure", "table")):
         if getattr(args, name) != getattr(Args, name) and not getattr(args, needed):
             raise ValueError(f"{flag(name)} needs {flag(needed)}")
@@ -802,7 +801,8 @@ def evaluation_row(counters: Counters, finished: list[tuple[float, int]]) -> dic
 
 
 class Stop:
-    """SIGINT or SIGTERM asks the loop to end at the next frame; a second one ends the process at once."""
+    """SIGINT or SIGTERM asks the loop to end at the next frame; a second SIGINT (Ctrl-C) ends the process at once. A
+    second SIGTERM does not: whoever stops a group of processes may send more than one."""
 
     def __init__(self):
         self.signum = 0
@@ -811,8 +811,8 @@ class Stop:
 
     def __call__(self, signum: int, _frame) -> None:
         self.signum = signum
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def bar_style() -> dict:
@@ -1184,15 +1184,17 @@ def started(folder: Path) -> str:
 
 
 def find_run(args: Args) -> str:
-    """The newest run directory in `args.runs_dir` with these very flags and a checkpoint; "" if there is none."""
-    for folder in sorted(Path(args.runs_dir).glob("*"), key=started, reverse=True):
+    """The run directory in `args.runs_dir` with these very flags and a checkpoint, of several the one that trains for
+    the most frames, then the newest; "" if there is none."""
+    found = []
+    for folder in Path(args.runs_dir).glob("*"):
         if (folder / "args.json").exists() and (folder / "checkpoint.pt").exists():
             saved = read_json_object(folder / "args.json")
             frames = saved.get("environment_train_frames_max", math.inf)  # may be raised
             if (frames <= args.environment_train_frames_max
                     and saved == vars(args) | {"resume": "", "environment_train_frames_max": frames}):
-                return str(folder)
-    return ""
+                found.append((frames, started(folder), str(folder)))
+    return max(found)[-1] if found else ""
 
 
 def study_runs(args: Args) -> list[tuple[Args, list[str]]]:
@@ -1330,7 +1332,7 @@ def iqm_interval(strata: list[list[float]], resamples: int = 50_000) -> str:
 
 def five_digits(value: float) -> str:
     """Five digits, as in the lecture, and no power of ten."""
-    return f"{float(f'{value:.5g}'):,.10g}"
+    return f"{float(f'{value:.5g}'):,.15g}"
 
 
 def others_last(label: str) -> tuple[bool, str]:
@@ -1455,6 +1457,7 @@ def report_tables(args: Args) -> None:
 
 def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind; or --study, or --table."""
+    wanted = 0
     try:
         if args.table or args.study or args.resume in ("", "auto"):  # a run's own flags are read first
             check_ablation_args(args)
@@ -1463,7 +1466,7 @@ def main(args: Args) -> None:
         if args.study:
             return run_study(args)
         if args.resume == "auto":
-            args = dataclasses.replace(args, resume=find_run(args))
+            wanted, args = args.environment_train_frames_max, dataclasses.replace(args, resume=find_run(args))
     except ValueError as error:
         fail(str(error))
     stop, resumed, saved = Stop(), args.resume, None
@@ -1471,6 +1474,8 @@ def main(args: Args) -> None:
         if resumed:
             run_dir, _lock = open_run(args, "")
             args = resumed_args(Args, run_dir)
+            frames = max(args.environment_train_frames_max, wanted)  # a default does not stand on the command line
+            args = dataclasses.replace(args, environment_train_frames_max=frames)
             check_ablation_args(args)
         device, precision = choose_device(args)
         encoding_name, replay_bytes = choose_encoding(args, device)

@@ -254,41 +254,6 @@ class Downsample(gym.ObservationWrapper):
         return cv2.resize(screen, (self.width, self.height), interpolation=cv2.INTER_LINEAR)  # (84, 84) uint8
 
 
-class RewardClip(gym.Wrapper):
-    """The reward is clipped to [-limit, limit]; the game's own stays in info["raw_reward"] (§7.2.1, training only)."""
-
-    def __init__(self, env: gym.Env, limit: float):
-        super().__init__(env)
-        self.limit = limit
-
-    def step(self, action: int):
-        frame, reward, terminated, truncated, info = self.env.step(action)
-        return frame, min(max(reward, -self.limit), self.limit), terminated, truncated, info | {"raw_reward": reward}
-
-
-class LifeLoss(gym.Wrapper):
-    """A lost life terminates the episode, and the game goes on (§7.2.1, training only). info["game_over"] tells a
-    game's end from a life's. Easy to get wrong: after a lost life reset() returns the very frame that the episode ended
-    with. If it reset the emulator, the later lives would never be seen; if it stepped, a frame would be missed."""
-
-    def __init__(self, env: gym.Env):
-        super().__init__(env)
-        self.lives, self.game_over = 0, True
-
-    def reset(self, **kwargs):
-        if self.game_over:
-            self.frame, self.info = self.env.reset(**kwargs)
-            self.lives, self.game_over = self.info["lives"], False
-        return self.frame, self.info
-
-    def step(self, action: int):
-        self.frame, reward, terminated, truncated, self.info = self.env.step(action)
-        life_lost = self.info["lives"] < self.lives
-        self.lives, self.game_over = self.info["lives"], terminated or truncated
-        self.info["game_over"] = self.game_over
-        return self.frame, reward, terminated or life_lost, truncated, self.info
-
-
 class FrameHistory(gym.Wrapper):
     """The state: references to the last `length` encoded frames, oldest first (§7.3.2). A frame is encoded once, when
     it arrives, and never changed; acting and replay decode the same objects. An episode starts with `length` references
@@ -324,18 +289,15 @@ def make_emulator(env_id: str) -> gym.Env:
                     max_num_frames_per_episode=108_000, disable_env_checker=True)
 
 
-def preprocess(env: gym.Env, args: Args, encode, rng: np.random.Generator, training: bool) -> gym.Env:
-    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the `if`)."""
+def evaluation_environment(env: gym.Env, args: types.SimpleNamespace, rng: np.random.Generator) -> gym.Env:
+    """Stack the transformations in the order of Figure 17: dqn_atari.py's `preprocess` without what training adds."""
     env = JoystickActions(env)
     env = NoOpReset(env, args.environment_no_op_max, rng)
     env = MaxPool(env, args.environment_frames_to_maxpool)
     env = ActionRepeat(env, args.agent_action_repeat)
     env = Greyscale(env)
     env = Downsample(env, args.environment_state_height, args.environment_state_width)
-    if training:
-        env = RewardClip(env, args.environment_reward_clip_limit)
-        env = LifeLoss(env)
-    return FrameHistory(env, args.agent_history_length, encode)
+    return FrameHistory(env, args.agent_history_length, torch.from_numpy)
 
 
 def wrapper(env: gym.Env, kind: type[gym.Wrapper]) -> gym.Wrapper:
@@ -345,21 +307,7 @@ def wrapper(env: gym.Env, kind: type[gym.Wrapper]) -> gym.Wrapper:
     return env
 
 
-# ---- memory: encoded frames ------------------------------------------------------------------------
-
-
-def frame_encoding(name: str, height: int, width: int, device: torch.device):
-    """Return (encode, decode). encode: (height, width) uint8 array -> an immutable object; decode: n such objects ->
-    (n, height, width) uint8 tensor on `device`."""
-    size = height * width
-    encode, decode = {
-        "lz4": (lambda frame: lz4.block.compress(frame, store_size=False),
-                lambda codes: torch.frombuffer(bytearray().join(
-                    [lz4.block.decompress(code, uncompressed_size=size) for code in codes]), dtype=torch.uint8)),
-        "raw": (lambda frame: frame, lambda codes: torch.from_numpy(np.stack(codes))),
-        "tensor": (lambda frame: torch.from_numpy(frame).to(device), torch.stack),
-    }[name]
-    return encode, lambda codes: decode(codes).view(-1, height, width).to(device)
+# ---- memory: recorded screens ------------------------------------------------------------------------
 
 
 def decode_screen(code: bytes) -> np.ndarray:
@@ -408,9 +356,10 @@ def find_network(args: Args) -> Path:
         if not path.is_file():
             raise ValueError(f"there is no network {path}")
         return path
-    newest_last = sorted(Path(args.runs_dir).glob("*/q_network.pt"), key=lambda path: path.stat().st_mtime)
-    if newest_last:
-        return newest_last[-1]
+    runs = Path(args.runs_dir)  # an ablation's are a folder deeper
+    found = [path for path in runs.rglob("q_network.pt") if "published" not in path.relative_to(runs).parts]
+    if found:
+        return max(found, key=lambda path: path.stat().st_mtime)
     for runs in (Path(args.runs_dir), Path(__file__).resolve().parent.parent / "runs"):
         path = runs / "published" / "pong" / "q_network.pt"
         if path.is_file():
@@ -505,13 +454,13 @@ class Frame:
 # ---- evaluation: a game, and where its value jumps -------------------------------------------------
 
 
-def play(env: gym.Env, decode, q_network: QNetwork, epsilon: float, exploration: np.random.Generator,
+def play(env: gym.Env, q_network: QNetwork, epsilon: float, exploration: np.random.Generator,
          state: tuple, bar: tqdm) -> list[Frame]:
     """Play one whole game from its first state, ε-greedily, for raw reward; returns its frames."""
     pool, recorder, frames = wrapper(env, MaxPool), wrapper(env, Recorder), []
     terminated = truncated = False
     while not (terminated or truncated):
-        q = action_values(q_network, decode(state))  # (num_actions,)
+        q = action_values(q_network, torch.stack(state))  # (num_actions,)
         greedy = exploration.random() >= epsilon
         action = int(q.argmax()) if greedy else int(exploration.integers(len(q)))
         screen = functools.reduce(np.maximum, pool.screens)  # (210, 160, 3) uint8
@@ -525,11 +474,12 @@ def play(env: gym.Env, decode, q_network: QNetwork, epsilon: float, exploration:
 
 def largest_jumps(values: np.ndarray, count: int) -> list[int]:
     """The frames t of the `count` largest |V(s_t) - V(s_{t-1})| of a game's values (T,), in order of time. The three
-    frames t-1, t, t+1 of a moment appear in no other, so that one event is one moment; T < 3 frames hold none."""
+    frames t-1, t, t+1 of a moment appear in no other, so that one event is one moment; a jump into the last frame is
+    shown with that frame as the third; T < 3 frames hold none."""
     changes = np.abs(np.diff(values))  # (T - 1,)
     moments: list[int] = []
     for before in np.argsort(-changes, kind="stable"):
-        t = min(int(before) + 1, len(values) - 2)  # the last frame has no next: it is shown as the third
+        t = min(int(before) + 1, len(values) - 2)
         if t >= 1 and all(abs(t - other) >= 3 for other in moments):
             moments.append(t)
         if len(moments) == count:
@@ -638,7 +588,10 @@ def save_moments(path: Path, frames: list[Frame], moments: list[int], actions: l
             axes.set_yticks([])
             axes.set_title(f"frame {i}\nvalue {frame.value:.3f}\n{actions[frame.action]}"
                            + ("" if frame.greedy else " (random)"), fontsize=11)
-        row[0].set_ylabel(f"moment {number}: value {frames[t].value - frames[t - 1].value:+.3f}", fontsize=12)
+        jump = frames[t].value - frames[t - 1].value
+        if t == len(frames) - 2:  # it stands for the jump into the last frame too
+            jump = max(jump, frames[t + 1].value - frames[t].value, key=abs)
+        row[0].set_ylabel(f"moment {number}: value {jump:+.3f}", fontsize=12)
     save_figure_file(path, figure)
 
 
@@ -788,9 +741,7 @@ def main(args: Args) -> None:
 
     torch.set_num_threads(1)  # one state at a time gains nothing from more, and their number would round Q differently
     exploration, no_ops = (np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(2))
-    shape = trained.environment_state_height, trained.environment_state_width
-    encode, decode = frame_encoding("raw", *shape, torch.device("cpu"))
-    env = preprocess(Recorder(make_emulator(trained.env_id)), trained, encode, no_ops, training=False)
+    env = evaluation_environment(Recorder(make_emulator(trained.env_id)), trained, no_ops)
     actions, recorder = wrapper(env, JoystickActions).meanings, wrapper(env, Recorder)
     print(f"network  {path}: {trained.env_id}, trained for {trained_frames:,} frames\n"
           f"actions  {' '.join(actions)}; epsilon {args.epsilon:g}, seed {args.seed}", flush=True)
@@ -800,7 +751,7 @@ def main(args: Args) -> None:
         for number in range(1, args.games + 1):
             state, _ = env.reset(seed=args.seed if number == 1 else None)
             with tqdm(desc=f"game {number} of {args.games}", unit="frame", **bar_style()) as bar:
-                played = play(env, decode, q_network, args.epsilon, exploration, state, bar)
+                played = play(env, q_network, args.epsilon, exploration, state, bar)
             finished.append((recorder.score, len(played)))
             print(f"game {number}   score {recorder.score:g}, length {len(played):,} frames", flush=True)
             if number == 1:
@@ -816,7 +767,8 @@ def main(args: Args) -> None:
         moments = largest_jumps(np.array([frame.value for frame in frames]), args.moments)
         save_trace(folder / "trace.csv", frames, actions)
         save_values(folder / "values.png", frames, moments, actions, f"{title}: score {score:g}, {len(frames)} frames")
-        save_moments(folder / "moments.png", frames, moments, actions, f"{title}: where the value jumps")
+        if moments:
+            save_moments(folder / "moments.png", frames, moments, actions, f"{title}: where the value jumps")
         if args.show_layers:
             save_filters(folder / "filters.png", q_network, trained.env_id)
         shown = recording[: math.ceil(min(args.video_seconds * FRAMES_PER_SECOND, len(recording)))]

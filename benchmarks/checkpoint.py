@@ -71,6 +71,9 @@ def main(args: Args) -> None:
         env, memory, history = fill(game, args.transitions)
         q_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n))
         optimizer = dqn.make_optimizer(dqn.Args(), q_network)
+        for parameter in q_network.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        optimizer.step()  # it has no state before its first step
         state = {"q_network": q_network.state_dict(), "target_network": q_network.state_dict(),
                  "optimizer": optimizer.state_dict(), "environment": dqn.environment_state(env)}
         with tempfile.TemporaryDirectory() as folder:

@@ -92,7 +92,8 @@ def stable_baselines3(args: Args, update_frequency: int, turns: Turns) -> None:
             return True
 
     gym.register_envs(ale_py)
-    env = VecFrameStack(make_atari_env(args.env_id, n_envs=1, seed=1), n_stack=4)
+    same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
+    env = VecFrameStack(make_atari_env(args.env_id, n_envs=1, seed=1, env_kwargs=same_game), n_stack=4)
     model = DQN("CnnPolicy", env, learning_rate=1e-4, buffer_size=WARM_UP + args.frames, learning_starts=1000,
                 batch_size=32, train_freq=update_frequency, gradient_steps=1, target_update_interval=1000,
                 exploration_fraction=1000 / (WARM_UP + args.frames), exploration_final_eps=0.01, seed=1)

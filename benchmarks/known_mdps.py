@@ -128,8 +128,8 @@ def evaluate(who: str, size: int, args: Args) -> tuple[float, float]:
     """V of the policy "first": seconds, and the largest residual |R + γ P V - V|."""
     if who == "ours":
         mdp = our_mdp(policy_evaluation, size, args.seed)
-        P, R = policy_evaluation.policy_system(mdp, mdp.first_row, ~mdp.terminal)
         started = time.perf_counter()
+        P, R = policy_evaluation.policy_system(mdp, mdp.first_row, ~mdp.terminal)
         V = policy_evaluation.solve_policy(P, R, args.discount, np.zeros(size))
     else:
         ddp = their_ddp(size, args.seed, args.discount)
@@ -165,8 +165,8 @@ def main() -> None:
     print(f"discount {args.discount}, ε {args.epsilon:g}")
     for size in args.sizes:
         print(f"\n{size:,} states, {size * ACTIONS * SUCCESSORS:,} transitions", flush=True)
-        ours, theirs = apart(600, sweeps, size, args)
-        print(f"  Bellman sweep: ours {ours}, QuantEcon {theirs}", flush=True)
+        if result := apart(600, sweeps, size, args):
+            print(f"  Bellman sweep: ours {result[0]}, QuantEcon {result[1]}", flush=True)
         for method in ("value iteration", "policy iteration"):
             values = []
             for who in ("ours", "QuantEcon"):

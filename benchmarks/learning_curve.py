@@ -38,8 +38,9 @@ def main(args: Args) -> None:
     axes.errorbar([int(row["frames"]) for row in rows], [float(row["score_mean"]) for row in rows],
                   [float(row["score_variance"]) ** 0.5 for row in rows], fmt="o", color="tab:orange", capsize=3,
                   label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, standard deviation")
-    if (args.run_dir / "test.json").exists():
-        test = json.loads((args.run_dir / "test.json").read_text())
+    path = args.run_dir / "test.json"
+    test = json.loads(path.read_text()) if path.exists() else {"scores": []}
+    if test["scores"]:
         axes.axhline(test["score_mean"], color="tab:green", linestyle="--",
                      label=f"final test, {len(test['scores'])} games: {test['score_mean']:.2f}")
     axes.set(xlabel="frames (each four of the emulator's)", ylabel="score of a game",

@@ -3,9 +3,9 @@
     python benchmarks/precision.py
 
 The same transitions (random play), the same minibatches, the same initial weights: `updates` updates of dqn_atari.py in
-each precision, for each seed. What was learnt is judged in float32 on transitions that neither saw: the mean Huber loss
-against the targets of the network's own copy, and the mean of max Q. If the difference between the precisions is of the
-size of the difference between seeds, the precision is harmless here.
+each precision, for each seed, θ⁻ copied at every 250th. What was learnt is judged in float32 on transitions that
+neither saw: the mean Huber loss against the targets of the network's own copy, and the mean of max Q. If the difference
+between the precisions is of the size of the difference between seeds, the precision is harmless here.
 """
 
 import copy
@@ -57,7 +57,7 @@ def learn(args: Args, seed: int, precision: torch.dtype, memory, num_actions: in
                    script_args.agent_discount_factor)
         if i % 250 == 0:
             target_network.load_state_dict(q_network.state_dict())
-        if i % (args.updates // 5) == 0:
+        if i % max(args.updates // 5, 1) == 0:
             target = copy.deepcopy(target_network).float()
             judgements.append(judge(q_network, target, held_out, script_args.agent_discount_factor))
     return judgements

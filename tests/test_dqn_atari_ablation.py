@@ -340,6 +340,16 @@ def test_a_study_skips_what_is_finished_and_resumes_what_was_cut_off(study, tmp_
     assert (code, len(commands)) == (0, 3) and len(list((tmp_path / "runs").glob("*/*"))) == 9
 
 
+def test_auto_trains_the_longest_run_on_to_the_frames_that_are_asked_for(tmp_path):
+    """Also where that number is the default, which a study leaves out of its commands: sys.argv is empty here."""
+    longest = run(tmp_path, environment_train_frames_max=150)
+    newest = run(tmp_path, environment_train_frames_max=120)
+    assert newest != longest
+    run(tmp_path, environment_train_frames_max=200, resume="auto")
+    frames = [read_json(run_dir / "test.json")["frames"] for run_dir in (longest, newest)]
+    assert frames == [200, 120] and len(list(tmp_path.iterdir())) == 2
+
+
 @posix
 def test_a_signal_to_the_study_stops_its_run_with_a_checkpoint(tmp_path):
     process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari_ablation.py", "--study", "initialization"],
@@ -354,6 +364,11 @@ def test_a_signal_to_the_study_stops_its_run_with_a_checkpoint(tmp_path):
     (checkpoint,) = tmp_path.glob("runs/default/*/checkpoint.pt")
     assert len(list(tmp_path.glob("runs/*/*"))) == 1
     ablation.load_checkpoint(checkpoint)
+
+
+def test_figures_have_five_digits_and_no_power_of_ten():
+    shown = {576.9234: "576.92", -0.012345678: "-0.012346", 1.23456e11: "123,460,000,000", 0.0: "0"}
+    assert {value: ablation.five_digits(value) for value in shown} == shown
 
 
 # ---- the tables and the figure ---------------------------------------------------------------------

@@ -15,6 +15,7 @@ import cv2
 import dqn_atari as dqn
 import dqn_atari_play as play
 import gymnasium as gym
+import lz4.block
 import numpy as np
 import pytest
 import torch
@@ -280,6 +281,15 @@ def test_jumps_are_drops_and_rises():
     assert play.largest_jumps(np.array([0.0, 1.0]), 1) == []
 
 
+def test_a_moment_at_the_end_is_labelled_with_the_jump_into_the_last_frame(tmp_path, monkeypatch):
+    figures, screen = [], lz4.block.compress(np.zeros((210, 160, 3), np.uint8))
+    frames = [play.Frame(np.array([value], np.float32), 0, True, 0.0, 0, screen, 0) for value in (0, 0, 0, 0, -9)]
+    monkeypatch.setattr(play, "save_figure_file", lambda _, figure: figures.append(figure))
+    play.save_moments(tmp_path / "moments.png", frames, [1, 3], ["NOOP"], "two moments")
+    labels = [axes.get_ylabel() for axes in figures[0].axes if axes.get_ylabel()]
+    assert labels == ["moment 1: value +0.000", "moment 2: value -9.000"]
+
+
 def test_filters_png_draws_all_32_filters(episode, network):
     weights = saved(network)["q_network"]["layers.conv1.weight"].numpy()
     panels = [axes for axes in episode.figures["filters.png"].axes if axes.images]
@@ -373,6 +383,9 @@ def test_without_an_argument_it_takes_the_newest_run_then_the_published_one(tmp_
         os.utime(tmp_path / name / "q_network.pt", (1e9 - age, 1e9 - age))
     (tmp_path / "d").mkdir()  # a run without a checkpoint yet
     assert play.find_network(args) == tmp_path / "a" / "q_network.pt"
+    (tmp_path / "no-target-network" / "e").mkdir(parents=True)  # an ablation's runs are a folder deeper
+    (tmp_path / "no-target-network" / "e" / "q_network.pt").touch()
+    assert play.find_network(args) == tmp_path / "no-target-network" / "e" / "q_network.pt"
 
 
 def test_interruption_and_a_full_disk_leave_no_broken_video(copied, quickly, monkeypatch, capsys):

@@ -344,6 +344,20 @@ for frame in range(200):
 
 
 @posix
+def test_a_second_sigterm_does_not_cut_the_checkpoint_off():
+    code = """
+import os, signal
+import dqn_atari as dqn
+stop = dqn.Stop()
+for _ in range(3):
+    os.kill(os.getpid(), signal.SIGTERM)
+print(stop.signum)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ALGORITHMS, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{int(signal.SIGTERM)}\n"), done.stderr
+
+
+@posix
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_saves_and_prints_the_command_that_resumes(tmp_path, signum, code):
     process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari.py", "--environment-test-frames", "100"],
