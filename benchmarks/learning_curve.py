@@ -46,7 +46,7 @@ def main(args: Args) -> None:
     axes.set(xlabel="frames (each four of the emulator's)", ylabel="score of a game",
              title=f"{run['env_id']}, seed {run['seed']}")
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower right")
     figure.savefig(args.run_dir / "learning_curve.png", dpi=100)
     print(f"wrote {args.run_dir / 'learning_curve.png'}: {len(scores)} training games, {len(rows)} evaluations")
 
