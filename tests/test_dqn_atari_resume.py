@@ -30,9 +30,19 @@ CAP = {"BreakoutNoFrameskip-v4": 108_000, "PongNoFrameskip-v4": 400}  # Pong: an
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, SIGKILL and file-size limits")
 
 
+def wait_for_the_next_second(run_dir: Path) -> None:
+    """TensorBoard reads event files in order of name: the second they were made in, then the process. Only a test
+    resumes within that second."""
+    made = max((int(path.name.split(".")[3]) for path in run_dir.glob("events*")), default=0)
+    while int(time.time()) <= made:
+        time.sleep(0.02)
+
+
 def run(folder: Path, env_id: str = "BreakoutNoFrameskip-v4", resume: Path | None = None, before_frame=None, **flags):
     """main() in this process, new or resumed; before_frame(n, transition) is called when the n-th transition is stored.
     Returns (exit code, run directory)."""
+    if resume:
+        wait_for_the_next_second(resume)
     with pytest.MonkeyPatch.context() as patch:
         make, add = dqn.make_emulator, dqn.ReplayMemory.add
 
