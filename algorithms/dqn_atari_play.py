@@ -307,7 +307,7 @@ def wrapper(env: gym.Env, kind: type[gym.Wrapper]) -> gym.Wrapper:
     return env
 
 
-# ---- memory: recorded screens ------------------------------------------------------------------------
+# ---- memory: recorded screens ----------------------------------------------------------------------
 
 
 def decode_screen(code: bytes) -> np.ndarray:
