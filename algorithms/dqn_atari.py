@@ -1112,6 +1112,7 @@ def main(args: Args) -> None:
     curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
     curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
     process, dead, loss = psutil.Process(), set(), None
+    # a multiple of the update frequency, so that every point has a fresh loss
     log_interval = math.ceil(LOG_INTERVAL / args.agent_update_frequency) * args.agent_update_frequency
     clock = checkpoint_time = time.monotonic()
 
@@ -1129,6 +1130,7 @@ def main(args: Args) -> None:
         counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
 
     def now() -> tuple[float, int, int]:
+        """Where a `window` begins, the frames whose rates are shown: no evaluation or checkpoint lies within one."""
         return time.monotonic(), counters.frames, counters.updates
 
     def checkpoint() -> bool:
@@ -1145,15 +1147,17 @@ def main(args: Args) -> None:
             "generators": [generator.bit_generator.state for generator in generators]}
         playable = attempt("q_network.pt", lambda: write_atomically(
             run_dir / "q_network.pt", lambda file: save_tensors(weights, file)))
-        return playable & attempt("checkpoint.pt", lambda: save_checkpoint(
+        resumable = attempt("checkpoint.pt", lambda: save_checkpoint(
             run_dir / "checkpoint.pt", everything, replay, state))
+        return playable and resumable
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
                bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]", **bar_style())
 
+    window = now()
+
     # 5-7 are `counters`; ε is a function of the frame. Evaluation stands first, so that one that was cut off is done
     # again when the run is resumed.
-    window = now()  # where the stretch began whose frames and updates a second are shown; no evaluation is part of it
     # 8  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max:
         # 27-29  Evaluate the agent.
