@@ -596,6 +596,27 @@ def initialize_he(q_network: QNetwork) -> None:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
 
 
+class LayersInOneDNN(nn.Sequential):
+    """The layers of a QNetwork, computed in the memory layout of oneDNN, PyTorch's library on CPUs. Layer by layer, it
+    would be converted to and from at every convolution."""
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        x = pixels.to_mkldnn()                                                        # (B, 4, 84, 84)
+        for layer in self:
+            if isinstance(layer, nn.Conv2d):
+                weight = layer.weight / 255 if isinstance(layer, PixelConv2d) else layer.weight
+                x = torch.mkldnn_convolution(x, weight, layer.bias, layer.padding, layer.stride, layer.dilation,
+                                             layer.groups)                            # (B, filters, height, width)
+            else:
+                x = layer(x.to_dense() if isinstance(layer, nn.Flatten) else x)
+        return x                                                                      # (B, 512)
+
+
+def multiplies_bfloat16() -> bool:
+    """Whether the CPU has instructions for it."""
+    return any(torch.cpu.get_capabilities().get(unit) for unit in ("avx512_bf16", "amx_bf16"))
+
+
 def working_copy(q_network: QNetwork, precision: torch.dtype) -> QNetwork:
     """The network that acts and learns while training: `q_network` itself, or its copy with layers of lower precision.
     The head stays float32: Q keeps more than bfloat16's three digits."""
@@ -603,6 +624,8 @@ def working_copy(q_network: QNetwork, precision: torch.dtype) -> QNetwork:
         return q_network
     working_network = copy.deepcopy(q_network)
     working_network.layers.to(precision)
+    if working_network.head.weight.is_cpu and multiplies_bfloat16():
+        working_network.layers = LayersInOneDNN(OrderedDict(working_network.layers.named_children()))
     for θ in q_network.parameters():
         θ.grad = torch.zeros_like(θ)  # `update` copies into it: allocated anew, its pages would cost time
     return working_network
@@ -1110,9 +1133,8 @@ def choose_device(args: Args) -> tuple[torch.device, torch.dtype]:
     name = args.device
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
-    multiplies_bfloat16 = any(torch.cpu.get_capabilities().get(unit) for unit in ("avx512_bf16", "amx_bf16"))
-    use_bfloat16 = args.precision == "bfloat16" or (args.precision == "auto" and name == "cpu" and multiplies_bfloat16)
-    return torch.device(name), torch.bfloat16 if use_bfloat16 else torch.float32
+    by_itself = args.precision == "auto" and name == "cpu" and multiplies_bfloat16()
+    return torch.device(name), torch.bfloat16 if args.precision == "bfloat16" or by_itself else torch.float32
 
 
 class Arm(NamedTuple):

@@ -8,6 +8,7 @@ import json
 import math
 import re
 import sys
+from collections import OrderedDict
 
 import ale_py
 import dqn_atari as dqn
@@ -460,6 +461,22 @@ def test_bfloat16_updates_keep_float32_weights_and_nearly_the_same_gradient():
     exact, rounded = gradients.values()
     assert rounded.dtype == torch.float32 and not torch.equal(exact, rounded)
     assert torch.cosine_similarity(exact, rounded, dim=0) > 0.999
+
+
+def test_onednn_layout_computes_what_the_layers_do():
+    torch.manual_seed(0)
+    states = torch.randint(0, 256, (8, 4, 84, 84), dtype=torch.uint8)
+    working_network = dqn.working_copy(dqn.QNetwork(4, 84, 84, 4), torch.bfloat16)
+    plain = copy.deepcopy(working_network)
+    plain.layers = torch.nn.Sequential(OrderedDict(plain.layers.named_children()))
+    values = []
+    for network in (working_network, plain):
+        values.append(network(states))
+        values[-1].square().sum().backward()
+    assert torch.allclose(*values, rtol=0.01, atol=0.001)
+    assert working_network.state_dict().keys() == plain.state_dict().keys()
+    for mine, theirs in zip(working_network.parameters(), plain.parameters(), strict=True):
+        assert torch.cosine_similarity(mine.grad.flatten().float(), theirs.grad.flatten().float(), dim=0) > 0.999
 
 
 def test_rmsprop_against_a_trace_by_hand():
