@@ -598,7 +598,7 @@ def initialize_he(q_network: QNetwork) -> None:
 
 class LayersInOneDNN(nn.Sequential):
     """The layers of a QNetwork, computed in the memory layout of oneDNN, PyTorch's library on CPUs. Layer by layer, it
-    would be converted to and from at every convolution."""
+    would be converted to and from at every convolution. (A layer that does not know this layout needs `to_dense`.)"""
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         x = pixels.to_mkldnn()                                                        # (B, 4, 84, 84)
