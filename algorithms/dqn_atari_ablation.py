@@ -557,8 +557,11 @@ class PixelConv2d(nn.Conv2d):
     """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
     up to rounding, and less work."""
 
+    def filters(self) -> torch.Tensor:
+        return self.weight / 255
+
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return self._conv_forward(pixels, self.weight / 255, self.bias)
+        return self._conv_forward(pixels, self.filters(), self.bias)
 
 
 class QNetwork(nn.Module):
@@ -604,7 +607,7 @@ class LayersInOneDNN(nn.Sequential):
         x = pixels.to_mkldnn()                                                        # (B, 4, 84, 84)
         for layer in self:
             if isinstance(layer, nn.Conv2d):
-                weight = layer.weight / 255 if isinstance(layer, PixelConv2d) else layer.weight
+                weight = layer.filters() if isinstance(layer, PixelConv2d) else layer.weight
                 x = torch.mkldnn_convolution(x, weight, layer.bias, layer.padding, layer.stride, layer.dilation,
                                              layer.groups)                            # (B, filters, height, width)
             else:

@@ -322,8 +322,11 @@ class PixelConv2d(nn.Conv2d):
     """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
     up to rounding, and less work."""
 
+    def filters(self) -> torch.Tensor:
+        return self.weight / 255
+
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return self._conv_forward(pixels, self.weight / 255, self.bias)
+        return self._conv_forward(pixels, self.filters(), self.bias)
 
 
 class QNetwork(nn.Module):
