@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from pathlib import Path
@@ -242,6 +243,8 @@ def in_a_child(folder: Path, limit: int | None = None, **arguments) -> int:
         return child
     code = 1
     try:
+        # tqdm's lock lies in memory that a fork shares: killed while it draws, the child would keep it from us for ever
+        dqn.tqdm.set_lock(threading.RLock())
         if limit:
             import resource
 
