@@ -51,7 +51,7 @@ Deviations
     [8]: a state begins with empty frames   a state begins with copies of the      one rule for acting and replay; no
                                             episode's first frame                  frame that was never on the screen
     [8]: 1 to 30 no-ops                     0 to 30 no-ops, in emulator frames     §7.2.1: "maximum number"
-    32-bit arithmetic                       bfloat16 while training, on CPUs       speed; the weights θ, the head, Adam
+    32-bit arithmetic                       bfloat16 while training, on x86 CPUs   speed; the weights θ, the head, Adam
                                             that have it (--precision)             and evaluation stay 32-bit
     raw frames, shared by reference         LZ4-compressed frames, by reference    0.4 to 1.4 GB instead of 11 GB
     [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
@@ -925,7 +925,7 @@ def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
             with io.BufferedReader(archive.open("archive/frames"), 1 << 20) as member:
                 return state, [member.read(length) for length in state["replay"]["lengths"].tolist()]
     except Exception as error:  # a damaged file can raise anything; none of it is a reason to go on
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path} cannot be resumed from: {reason}") from None
 
 
@@ -950,7 +950,8 @@ def restore_run(saved: dict, codes, replay: ReplayMemory, env: gym.Env, generato
         for generator, generator_state in zip(generators, saved["generators"], strict=True):
             generator.bit_generator.state = generator_state
     except Exception as error:  # whatever it is, it is no reason to go on from half a state
-        raise ValueError(f"its {part} does not fit ({str(error).splitlines()[0]})") from None
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"its {part} does not fit ({reason})") from None
     return state
 
 
@@ -1077,8 +1078,10 @@ def main(args: Args) -> None:
     except ValueError as error:
         fail(str(error))
     counters = Counters(**saved["counters"]) if saved else Counters()
-    test = run_dir / "test.json"
-    tested = json.loads(test.read_text())["frames"] if test.exists() else None
+    try:
+        tested = json.loads((run_dir / "test.json").read_text())["frames"]
+    except (OSError, ValueError, LookupError, TypeError):  # no test yet, or no whole one: it is done again
+        tested = None
     if tested == counters.frames >= args.environment_train_frames_max:
         print(f"{run_dir} has finished its {counters.frames:,} frames; --environment-train-frames-max trains on")
         return
@@ -1154,6 +1157,9 @@ def main(args: Args) -> None:
         nonlocal clock
         counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
 
+    def keep_evaluations() -> bool:
+        return attempt("evaluations.csv", lambda: write_csv(run_dir / "evaluations.csv", counters.evaluation_rows))
+
     def now() -> tuple[float, int, int]:
         """Where a `window` begins, the frames whose rates are shown: no evaluation or checkpoint lies within one."""
         return time.monotonic(), counters.frames, counters.updates
@@ -1170,11 +1176,12 @@ def main(args: Args) -> None:
             "target_network": target_network.state_dict(), "optimizer": optimizer.state_dict(),
             "counters": dataclasses.asdict(counters), "environment": environment_state(env),
             "generators": [generator.bit_generator.state for generator in generators]}
+        evaluated = not counters.evaluation_rows or keep_evaluations()  # again, for the disk may have been full
         playable = attempt("q_network.pt", lambda: write_atomically(
             run_dir / "q_network.pt", lambda file: save_tensors(weights, file)))
         resumable = attempt("checkpoint.pt", lambda: save_checkpoint(
             run_dir / "checkpoint.pt", everything, replay, state))
-        return playable and resumable
+        return evaluated and playable and resumable
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
                bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]", **bar_style())
@@ -1195,7 +1202,7 @@ def main(args: Args) -> None:
                 count_seconds()
                 row = evaluation_row(counters, finished)
                 counters.evaluation_rows.append(row)
-                attempt("evaluations.csv", lambda: write_csv(run_dir / "evaluations.csv", counters.evaluation_rows))
+                keep_evaluations()
                 columns = ("score_mean", "score_variance", "length_mean")
                 curves.add({f"evaluation/{name}": row[name] for name in columns}, counters.frames)
                 tqdm.write(f"evaluation {counters.evaluations} at frame {counters.frames:,}, "
@@ -1287,7 +1294,7 @@ def main(args: Args) -> None:
     count_seconds()
     result = evaluation_row(counters, finished)
     modules = (torch, np, gym, ale_py, cv2)
-    saved_at_the_end &= attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
+    saved_at_the_end = saved_at_the_end and attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
         "scores": [score for score, _ in finished], "lengths": [length for _, length in finished],
         "seed": args.seed, "env_id": args.env_id, "device": f"{device}, {platform.machine()}, {os.cpu_count()} cores",
         "precision": str(precision).removeprefix("torch."), "threads": torch.get_num_threads(),

@@ -5,7 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # small problems: threads cost more than they bring
+os.environ["OMP_NUM_THREADS"] = "1"  # small problems: threads cost more than they bring, and do not survive a fork
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the same device on every machine
 
 import pytest
 

@@ -21,7 +21,7 @@ from torch import nn
 
 PONG, BREAKOUT = "PongNoFrameskip-v4", "BreakoutNoFrameskip-v4"
 CPU = torch.device("cpu")
-SHORT = dict(env_id=BREAKOUT, environment_train_frames_max=400, agent_replay_buffer_initial=100,
+SHORT = dict(device="cpu", env_id=BREAKOUT, environment_train_frames_max=400, agent_replay_buffer_initial=100,
              optimizer_minibatch_size=8, agent_update_frequency=4, environment_test_frames=200)  # a run of two seconds
 
 # Table 3 of the lecture, in its order
@@ -289,7 +289,7 @@ def test_rewards_are_clipped_in_training_only():
     assert raw == rewards[False]
 
 
-def test_time_limit_truncates_after_108000_emulator_frames():
+def test_the_emulator_is_asked_for_no_frame_skip_no_sticky_actions_and_108000_frames():
     env = dqn.make_emulator(PONG)
     assert env.spec.kwargs["max_num_frames_per_episode"] == 108_000
     assert env.spec.kwargs["repeat_action_probability"] == 0.0 and env.spec.kwargs["frameskip"] == 1
@@ -463,6 +463,7 @@ def test_bfloat16_updates_keep_float32_weights_and_nearly_the_same_gradient():
     assert torch.cosine_similarity(exact, rounded, dim=0) > 0.999
 
 
+@pytest.mark.skipif(not dqn.multiplies_bfloat16(), reason="only where the CPU multiplies bfloat16 is it used")
 def test_onednn_layout_computes_what_the_layers_do():
     torch.manual_seed(0)
     states = torch.randint(0, 256, (8, 4, 84, 84), dtype=torch.uint8)
@@ -507,7 +508,7 @@ def test_rmsprop_stays_finite_with_unequal_decays(decays):
     assert module.weight.isfinite().all()  # n - g² is negative here
 
 
-def test_optimizers_differ_and_both_learn(train):
+def test_optimizers_differ(train):
     runs = [train(optimizer_name=name)[0] for name in ("Adam", "RMSprop")]
     assert not same(weights(runs[0]), weights(runs[1]))
     optimizer = torch.load(runs[1] / "checkpoint.pt", weights_only=True)["optimizer"]
@@ -617,7 +618,7 @@ BAD_FLAGS = {
     "--optimizer-minibatch-size many": "--optimizer-minibatch-size",
     "--device cuda": "sees no such device",
     "--no-such-flag 1": "--no-such-flag",
-    "--agent-replay-buffer-maximum-length 1000000000 --environment-train-frames-max 1000000000": "lower --agent-replay",
+    f"--agent-replay-buffer-maximum-length {10**15} --environment-train-frames-max {10**15}": "lower --agent-replay",
     "--runs-dir occupied": "cannot be written",
     "--resume nowhere": "no run directory",
 }
@@ -638,8 +639,8 @@ def test_bad_input_is_one_line_and_exit_code_2(flags, tmp_path, monkeypatch, cap
 
 
 def test_memory_that_is_not_free_is_refused_with_numbers():
-    args = dqn.Args(agent_replay_buffer_maximum_length=10**9, environment_train_frames_max=10**9)
-    with pytest.raises(ValueError, match=r"1,000,000,000 transitions needs [\d.]+ GB, [\d.]+ GB are free"):
+    args = dqn.Args(agent_replay_buffer_maximum_length=10**15, environment_train_frames_max=10**15)
+    with pytest.raises(ValueError, match=r"1(,000){5} transitions needs [\d.]+ GB, [\d.]+ GB are free"):
         dqn.choose_encoding(args, CPU)
     name, need = dqn.choose_encoding(dqn.Args(), CPU)
     assert name == "lz4" and 0.2e9 < need < 0.8e9  # a million frames of Pong

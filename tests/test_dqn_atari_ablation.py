@@ -5,7 +5,6 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import re
 import shlex
 import signal
@@ -24,8 +23,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_dqn_atari import BREAKOUT, same, weights
 from test_dqn_atari_resume import plain, posix, stop_at
 
-SHORT = dict(environment_train_frames_max=400, agent_replay_buffer_initial=100, agent_replay_buffer_maximum_length=150,
-             optimizer_minibatch_size=32, agent_update_frequency=8, environment_test_frames=300,
+SHORT = dict(device="cpu", environment_train_frames_max=400, agent_replay_buffer_initial=100,
+             agent_replay_buffer_maximum_length=150, optimizer_minibatch_size=32, agent_update_frequency=8,
+             environment_test_frames=300,
              environment_evaluation_interval_episodes=3, environment_evaluation_episodes=1,
              agent_epsilon_greedy_epsilon_evaluation=0.5, optimizer_q_network_parameter_update_interval_frames=104)
 HELD_OUT_STATES = ablation.HELD_OUT_STATES
@@ -317,7 +317,7 @@ def test_a_study_skips_what_is_finished_and_resumes_what_was_cut_off(study, tmp_
     def stop_the_second(frame, _):
         if frame == 15 and len(list((tmp_path / "runs").glob("*/*"))) == 2 and not interrupted:
             interrupted.append(frame)
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
 
     code, lines, commands = study("--study", "ablation", *TINY, before_frame=stop_the_second)
     assert (code, len(commands)) == (1, 4)  # the second ended before its time, the others went on
@@ -351,15 +351,19 @@ def test_auto_trains_the_longest_run_on_to_the_frames_that_are_asked_for(tmp_pat
 
 
 @posix
-def test_a_signal_to_the_study_stops_its_run_with_a_checkpoint(tmp_path):
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_study_stops_its_run_with_a_checkpoint(signum, tmp_path):
     process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari_ablation.py", "--study", "initialization"],
                                cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if line.startswith("run      "):
-            break
-    process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 143 and "Traceback" not in err, err
+    try:
+        for line in process.stdout:
+            if line.startswith("run      "):
+                break
+        process.send_signal(signum)  # to the study alone
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 128 + signum and "Traceback" not in err, err
     assert "stopped at frame" in out and out.endswith("stopped; the same command goes on\n")
     (checkpoint,) = tmp_path.glob("runs/default/*/checkpoint.pt")
     assert len(list(tmp_path.glob("runs/*/*"))) == 1

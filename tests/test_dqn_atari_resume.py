@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 import zipfile
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from conftest import ALGORITHMS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 FRAMES = 500
-SHORT = dict(precision="bfloat16", environment_train_frames_max=FRAMES, agent_replay_buffer_initial=150,
+SHORT = dict(device="cpu", precision="bfloat16", environment_train_frames_max=FRAMES, agent_replay_buffer_initial=150,
              optimizer_minibatch_size=8, agent_update_frequency=4, environment_test_frames=150,
              environment_evaluation_interval_episodes=4, environment_evaluation_episodes=1,
              environment_checkpoint_interval_episodes=2, optimizer_q_network_parameter_update_interval_frames=70)
@@ -125,7 +126,7 @@ def straight(request, tmp_path_factory):
 
 
 def stop_at(frame: int, signum: int = signal.SIGTERM):
-    return lambda n, _: os.kill(os.getpid(), signum) if n == frame else None
+    return lambda n, _: signal.raise_signal(signum) if n == frame else None
 
 
 # ---- exact -----------------------------------------------------------------------------------------
@@ -150,7 +151,7 @@ def test_an_evaluation_that_was_cut_off_is_done_again(straight, tmp_path, monkey
     def interrupted(args, q_network, encoding, number, stop, **limit):
         if number == 1 and not cut:
             cut.append(number)
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         return evaluate(args, q_network, encoding, number, stop, **limit)
 
     monkeypatch.setattr(dqn, "evaluate", interrupted)
@@ -241,7 +242,7 @@ def in_a_child(folder: Path, limit: int | None = None, **arguments) -> int:
     child = os.fork()
     if child:
         return child
-    code = 1
+    code = 70  # none of main's
     try:
         # tqdm's lock lies in memory that a fork shares: killed while it draws, the child would keep it from us for ever
         dqn.tqdm.set_lock(threading.RLock())
@@ -251,6 +252,8 @@ def in_a_child(folder: Path, limit: int | None = None, **arguments) -> int:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
         sys.stderr = sys.stdout = open(folder.parent / "child.log", "a")
         code = run(folder, **arguments)[0]
+    except BaseException:
+        traceback.print_exc()
     finally:
         sys.stderr.flush()
         os._exit(code)
@@ -264,7 +267,7 @@ def test_thirty_kills_while_checkpointing_lose_nothing(tmp_path):
     folder.mkdir()
     started = time.monotonic()
     _, expected = run(tmp_path / "straight", **flags)
-    duration, kills = time.monotonic() - started, 0
+    duration, kills, frames = time.monotonic() - started, 0, set()
     while kills < 30:
         run_dir = next(folder.iterdir(), None)
         resume = run_dir if run_dir and (run_dir / "checkpoint.pt").exists() else None
@@ -282,7 +285,8 @@ def test_thirty_kills_while_checkpointing_lose_nothing(tmp_path):
         checkpoint = next(folder.iterdir(), folder) / "checkpoint.pt"
         saved = checkpoint.exists()
         if saved:
-            dqn.load_checkpoint(checkpoint)  # whole, whatever the moment
+            frames.add(dqn.load_checkpoint(checkpoint)[0]["counters"]["frames"])  # whole, whatever the moment
+    print(sorted(frames))
     _, run_dir = run(folder, resume=checkpoint.parent) if saved else run(tmp_path / "again", **flags)
     assert everything(run_dir) == everything(expected)
 
@@ -297,14 +301,13 @@ def test_a_full_disk_loses_nothing_and_training_goes_on(tmp_path):
     assert os.WEXITSTATUS(status) == 1, log  # the last frames could not be kept, and that is said
     assert log.count("warning: checkpoint.pt could not be written (File too large); the run goes on") > 1
     assert (run_dir / "checkpoint.pt").read_bytes() == before
-    assert (run_dir / "test.json").exists() and not list(run_dir.glob("*.tmp"))
-    (run_dir / "test.json").unlink()
-    assert run(folder, resume=run_dir)[0] == 0
+    assert not (run_dir / "test.json").exists() and not list(run_dir.glob("*.tmp"))
+    assert run(folder, resume=run_dir)[0] == 0 and (run_dir / "test.json").exists()
     assert dqn.load_checkpoint(run_dir / "checkpoint.pt")[0]["counters"]["frames"] == FRAMES
 
 
-@pytest.mark.parametrize("lost", ["q_network.pt", "test.json"])
-def test_a_result_that_could_not_be_kept_is_a_failure(tmp_path, capsys, monkeypatch, lost):
+@pytest.mark.parametrize("lost", ["q_network.pt", "evaluations.csv", "test.json"])
+def test_a_result_that_could_not_be_kept_is_a_failure_that_resuming_mends(tmp_path, capsys, monkeypatch, lost):
     write = dqn.write_atomically
 
     def refuse(path, content):
@@ -313,8 +316,11 @@ def test_a_result_that_could_not_be_kept_is_a_failure(tmp_path, capsys, monkeypa
         write(path, content)
 
     monkeypatch.setattr(dqn, "write_atomically", refuse)
-    assert run(tmp_path, environment_train_frames_max=160)[0] == 1
+    code, run_dir = run(tmp_path, environment_train_frames_max=160, environment_evaluation_interval_episodes=1)
+    assert code == 1 and not (run_dir / lost).exists()
     assert f"warning: {lost} could not be written (No space left on device)" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert run(tmp_path, resume=run_dir)[0] == 0 and (run_dir / lost).exists()
 
 
 def test_curves_that_cannot_be_written_do_not_end_the_run(tmp_path, capsys, monkeypatch):
@@ -359,11 +365,11 @@ for frame in range(200):
 @posix
 def test_a_second_sigterm_does_not_cut_the_checkpoint_off():
     code = """
-import os, signal
+import signal
 import dqn_atari as dqn
 stop = dqn.Stop()
 for _ in range(3):
-    os.kill(os.getpid(), signal.SIGTERM)
+    signal.raise_signal(signal.SIGTERM)
 print(stop.signum)
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ALGORITHMS, capture_output=True, text=True)
@@ -375,18 +381,21 @@ print(stop.signum)
 def test_a_signal_saves_and_prints_the_command_that_resumes(tmp_path, signum, code):
     process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari.py", "--environment-test-frames", "100"],
                                cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if line.startswith("run "):
-            break
-    time.sleep(1)
-    process.send_signal(signum)
-    out, err = process.communicate(timeout=60)
+    try:
+        for line in process.stdout:
+            if line.startswith("run "):
+                break
+        time.sleep(1)
+        process.send_signal(signum)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == code and "Traceback" not in err, err
     (run_dir,) = (tmp_path / "runs").iterdir()
     command = [sys.executable, str(ALGORITHMS / "dqn_atari.py"), "--resume", str(Path("runs") / run_dir.name)]
     assert f"go on with: {shlex.join(command)}\n" in out
     frames = int(re.search(r"stopped at frame ([\d,]+)", out)[1].replace(",", ""))
-    assert dqn.load_checkpoint(run_dir / "checkpoint.pt")[0]["counters"]["frames"] == frames > 0
+    assert dqn.load_checkpoint(run_dir / "checkpoint.pt")[0]["counters"]["frames"] == frames
     assert torch.load(run_dir / "q_network.pt", weights_only=True)["frames"] == frames
 
 
@@ -451,6 +460,14 @@ def test_a_finished_run_says_so(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in run_dir.iterdir()} == before
 
 
+def test_half_a_test_is_done_again(tmp_path):
+    _, run_dir = run(tmp_path, environment_train_frames_max=160)
+    whole = (run_dir / "test.json").read_text()
+    (run_dir / "test.json").write_text(whole[:20])
+    assert run(tmp_path, resume=run_dir)[0] == 0
+    assert json.loads((run_dir / "test.json").read_text())["scores"] == json.loads(whole)["scores"]
+
+
 def test_a_test_cut_off_after_training_on_is_done(tmp_path):
     _, run_dir = run(tmp_path, environment_train_frames_max=160)
     assert run(tmp_path, resume=run_dir, environment_train_frames_max=200, before_frame=stop_at(200))[0] == 143
@@ -469,9 +486,12 @@ def test_two_processes_cannot_write_one_run(copy, capsys):
 def test_the_lock_of_a_dead_process_is_free(copy):
     child = os.fork()
     if not child:
-        dqn.filelock.FileLock(copy / ".lock").acquire(timeout=0)
-        os.kill(os.getpid(), signal.SIGKILL)
-    os.waitpid(child, 0)
+        try:
+            dqn.filelock.FileLock(copy / ".lock").acquire(timeout=0)
+            signal.raise_signal(signal.SIGKILL)
+        finally:
+            os._exit(1)
+    assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
     assert run(copy.parent, resume=copy)[0] == 0
 
 

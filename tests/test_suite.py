@@ -4,11 +4,13 @@ import ast
 import itertools
 import re
 import sys
+from importlib.metadata import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = sorted((ROOT / "algorithms").glob("*.py"))
@@ -91,6 +93,13 @@ def test_readme_names_every_script():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     for path in SCRIPTS:
         assert f"algorithms/{path.name}" in readme
+
+
+def test_readme_asks_for_a_python_that_the_pinned_packages_take():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (python,) = re.findall(r"^Python (3\.\d+) or later", readme, re.MULTILINE)
+    for name in pinned():
+        assert SpecifierSet(metadata(name).get("Requires-Python", "")).contains(f"{python}.0"), name
 
 
 def test_readme_commands_are_the_ones_that_ci_runs():
