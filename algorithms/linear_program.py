@@ -205,6 +205,8 @@ def mdp_from_json(model: dict) -> MDP:
         raise ValueError('"terminal" must be a list of states')
     states = list(dict.fromkeys([*transitions, *terminal]))
     start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
+    if not states:
+        raise ValueError("the model has no states")
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
@@ -239,7 +241,11 @@ def mdp_from_json(model: dict) -> MDP:
     shape = (len(actions), len(states))
     P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
     # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R = sparse.csr_array((P.data * rewards, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+    R, size = (
+        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+        for factor in (rewards, np.abs(rewards))
+    )
+    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
     return MDP(
         states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
         start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
@@ -352,9 +358,20 @@ def maximum(mdp: MDP, Q: np.ndarray) -> np.ndarray:
     return np.maximum.reduceat(Q, mdp.first_row)  # (S,)
 
 
+def slack(best: np.ndarray, tolerance: float) -> np.ndarray:
+    """(S,) How far below `best` (S,) still counts as equal: `tolerance` of that value's size where it is above 1.
+
+    Easy to get wrong: of the largest |Q| of all, one forbidden action at -1e9 would make ties of good and bad. (But
+    1e-11 of the largest value is what solving and summing leave of it everywhere.)
+    """
+    size = np.abs(best)  # (S,)
+    return np.maximum(tolerance * np.maximum(1.0, size), 1e-11 * size.max())
+
+
 def tied_rows(mdp: MDP, Q: np.ndarray, tolerance: float) -> np.ndarray:
-    """(rows,) bool: the actions that come within `tolerance` of the best of their state."""
-    return Q >= (maximum(mdp, Q) - max(1e-9, tolerance) * max(1.0, np.abs(Q).max()))[mdp.state_of_row]
+    """(rows,) bool: the actions that come within `tolerance`, or 1e-9 if that is more, of the best of their state."""
+    best = maximum(mdp, Q)  # (S,)
+    return Q >= (best - slack(best, max(1e-9, tolerance)))[mdp.state_of_row]
 
 
 def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
@@ -691,14 +708,18 @@ def main() -> None:
         started = time.perf_counter()
         solution, visits = linear_program(mdp, args.discount, args.tolerance, args.max_iterations)
         solved = time.perf_counter()
-        V, _, changes, history = value_iteration(mdp, args.discount, args.tolerance, args.max_iterations)
+        try:
+            V, _, changes, history = value_iteration(mdp, args.discount, args.tolerance, args.max_iterations)
+            apart = f"their V differ by at most {np.abs(solution.V - V).max():.3g}"
+        except ValueError as error:  # that does not make the program's solution wrong
+            changes, history, apart = [], [], str(error)
         iterated = time.perf_counter()
         if readable(mdp):
             print_program(mdp, args.discount, solution, visits)
         print_solution(mdp, solution)
         print(f"Σ V = {solution.V.sum():.12g}; dual Σ visits·R = {visits @ mdp.R:.12g} (equal if both are optimal)\n")
         times = f"linear program {1e3 * (solved - started):.3g} ms, value iteration {1e3 * (iterated - solved):.3g} ms"
-        print(f"{times} ({len(changes)} sweeps); their V differ by at most {np.abs(solution.V - V).max():.3g}")
+        print(f"{times} ({len(changes)} sweeps); {apart}")
         visits_by_name = as_json(mdp, dataclasses.replace(solution, Q=visits))["action_values"]
         save_json(args.output_json, {**as_json(mdp, solution), "visits": visits_by_name})
         solution.changes, solution.history = changes, history

@@ -207,6 +207,8 @@ def mdp_from_json(model: dict) -> MDP:
         raise ValueError('"terminal" must be a list of states')
     states = list(dict.fromkeys([*transitions, *terminal]))
     start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
+    if not states:
+        raise ValueError("the model has no states")
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
@@ -241,7 +243,11 @@ def mdp_from_json(model: dict) -> MDP:
     shape = (len(actions), len(states))
     P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
     # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R = sparse.csr_array((P.data * rewards, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+    R, size = (
+        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+        for factor in (rewards, np.abs(rewards))
+    )
+    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
     return MDP(
         states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
         start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
@@ -430,7 +436,12 @@ def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndar
         if np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
             return V
     # V = R + γ P V  Equation 3, that is (I - γ P) V = R
-    return np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", linalg.MatrixRankWarning)
+        V = np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
+    if not np.isfinite(V).all():
+        raise ValueError("V = R + γ P V has no single solution: somewhere probabilities sum to 1 only by rounding")
+    return V
 
 
 def solve_exactly(mdp: MDP, policy: np.ndarray, live: np.ndarray, discount: float) -> dict[int, Fraction]:
@@ -672,7 +683,7 @@ def print_policy(
     print("Linear system (Equations 2 and 3):")
     for s in states[::-1]:
         right = worked(mdp, policy[s], discount, lambda s_next: f"V({mdp.states[s_next]})") if live[s] else "0"
-        never = "" if live[s] or mdp.terminal[s] else "   (it never leaves, and every reward is 0)"
+        never = "" if live[s] or mdp.terminal[s] else "   (it never leaves, and expects a reward of 0)"
         print(f"  V({mdp.states[s]}) = {right}{never}")
     exact = solve_exactly(mdp, policy, live, discount)
     print("Solution: " + ", ".join(f"V({mdp.states[s]}) = {exact.get(s, 0)}" for s in states[::-1]))

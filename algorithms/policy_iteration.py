@@ -77,7 +77,7 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], weight of a reward one step later (the lecture is undiscounted: 1)"""
     tolerance: float = 1e-9
-    """an action is changed only for a gain above this (times max |V|, where that is above 1), in units of reward"""
+    """an action is changed only for a gain above this (times |V(s)|, where that is above 1), in units of reward"""
     max_iterations: int = 100_000
     """improvements of the policy after which to give up, an error"""
     output_json: Path | None = None
@@ -208,6 +208,8 @@ def mdp_from_json(model: dict) -> MDP:
         raise ValueError('"terminal" must be a list of states')
     states = list(dict.fromkeys([*transitions, *terminal]))
     start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
+    if not states:
+        raise ValueError("the model has no states")
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
@@ -242,7 +244,11 @@ def mdp_from_json(model: dict) -> MDP:
     shape = (len(actions), len(states))
     P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
     # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R = sparse.csr_array((P.data * rewards, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+    R, size = (
+        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+        for factor in (rewards, np.abs(rewards))
+    )
+    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
     return MDP(
         states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
         start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
@@ -420,7 +426,7 @@ def policy_iteration(
             choices = Q.copy()  # (rows,)
             choices[rest] = np.maximum(choices[rest], 0)  # what can go on for ever with reward 0 is worth at least that
             best = maximum(mdp, choices)  # (S,)
-            better = best > choices[policy] + tolerance * max(1.0, np.abs(V).max())  # (S,)
+            better = best > choices[policy] + slack(best, tolerance)  # (S,)
             argmax = first_rows(mdp, np.flatnonzero(choices >= best[mdp.state_of_row]))  # (S,)
             previous, policy = policy, np.where(better, argmax, policy)
             bar.update()
@@ -443,9 +449,20 @@ def maximum(mdp: MDP, Q: np.ndarray) -> np.ndarray:
     return np.maximum.reduceat(Q, mdp.first_row)  # (S,)
 
 
+def slack(best: np.ndarray, tolerance: float) -> np.ndarray:
+    """(S,) How far below `best` (S,) still counts as equal: `tolerance` of that value's size where it is above 1.
+
+    Easy to get wrong: of the largest |Q| of all, one forbidden action at -1e9 would make ties of good and bad. (But
+    1e-11 of the largest value is what solving and summing leave of it everywhere.)
+    """
+    size = np.abs(best)  # (S,)
+    return np.maximum(tolerance * np.maximum(1.0, size), 1e-11 * size.max())
+
+
 def tied_rows(mdp: MDP, Q: np.ndarray, tolerance: float) -> np.ndarray:
-    """(rows,) bool: the actions that come within `tolerance` of the best of their state."""
-    return Q >= (maximum(mdp, Q) - max(1e-9, tolerance) * max(1.0, np.abs(Q).max()))[mdp.state_of_row]
+    """(rows,) bool: the actions that come within `tolerance`, or 1e-9 if that is more, of the best of their state."""
+    best = maximum(mdp, Q)  # (S,)
+    return Q >= (best - slack(best, max(1e-9, tolerance)))[mdp.state_of_row]
 
 
 def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
@@ -467,7 +484,12 @@ def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndar
         if np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
             return V
     # V = R + γ P V  Equation 3, that is (I - γ P) V = R
-    return np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", linalg.MatrixRankWarning)
+        V = np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
+    if not np.isfinite(V).all():
+        raise ValueError("V = R + γ P V has no single solution: somewhere probabilities sum to 1 only by rounding")
+    return V
 
 
 # ---- evaluation: which values are finite without a discount --------------------------------------

@@ -303,7 +303,7 @@ def numbered(env: gym.Env) -> gym.Env:
         raise ValueError(f"a table needs discrete observations, not {space}")
     if not isinstance(env.action_space, gym.spaces.Discrete):
         raise ValueError(f"a table needs discrete actions, not {env.action_space}")
-    if len(sizes) > 1 or first[0] != 0:
+    if not isinstance(space, gym.spaces.Discrete) or first[0] != 0:
         states = gym.spaces.Discrete(math.prod(sizes))
         env = TransformObservation(env, lambda o: int(np.ravel_multi_index(np.ravel(o) - first, sizes)), states)
     if env.action_space.start != 0:
@@ -443,7 +443,8 @@ def optimal_action_values(P: sparse.csr_array, R: np.ndarray, discount: float, m
         previous, Q = Q, R + discount * (P @ Q.reshape(P.shape[1], -1).max(axis=1))  # (S·A,)
         if np.abs(Q - previous).max() <= 1e-13 * max(1, np.abs(Q).max()):
             return Q.reshape(P.shape[1], -1)
-    raise ValueError(f"Q* has not converged in {max_sweeps} sweeps: a discount below {discount} makes it finite")
+    hint = ": a discount below 1 makes it finite" if discount == 1 else ""
+    raise ValueError(f"Q* has not converged in {max_sweeps:,} sweeps{hint}")
 
 
 def decision_states(P: sparse.csr_array, start: np.ndarray) -> np.ndarray:
@@ -578,11 +579,12 @@ def table_as_json(names: list[str], actions: list[str], Q: np.ndarray, known: np
 
 def make_run_dir(runs_dir: Path, env_id: str, script: str, seed: int) -> Path:
     """Make the folder runs_dir/{env_id}__{script}__{seed}__{time}; a second one in the same second is numbered."""
-    name = f"{env_id.replace('/', '-')}__{script}__{seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    folders = itertools.chain([runs_dir / name], (runs_dir / f"{name}-{i}" for i in itertools.count(2)))
-    run_dir = next(folder for folder in folders if not folder.exists())
-    run_dir.mkdir(parents=True)
-    return run_dir
+    name = f"{env_id.replace('/', '-').replace(':', '-')}__{script}__{seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    runs_dir.mkdir(parents=True, exist_ok=True)
+    for run_dir in itertools.chain([runs_dir / name], (runs_dir / f"{name}-{i}" for i in itertools.count(2))):
+        with contextlib.suppress(FileExistsError):
+            run_dir.mkdir()
+            return run_dir
 
 
 # ---- main ----------------------------------------------------------------------------------------
@@ -656,7 +658,7 @@ def main() -> None:
         result = {"episodes": evaluation.episode, "steps": evaluation.steps, "visits": evaluation.visits.tolist()}
         if Q_star is not None:
             result |= {"max_error": errors[-1], "optimal_states": optimal[-1], "states": int(deciding.sum())}
-            print(f"max |Q - Q*| = {errors[-1]:.4f}; the policy is optimal in {optimal[-1]} of {deciding.sum()} states")
+            print(f"max |Q - Q*| = {errors[-1]:.4f}; an optimal action in {optimal[-1]} of {deciding.sum()} states")
         last = evaluation.episode - (history[-2].episode if len(history) > 1 else 0)
         print(f"mean return of the last {last} episodes, while exploring with ε = {evaluation.epsilon:.2f}: "
               f"{evaluation.mean_return:.4g}")

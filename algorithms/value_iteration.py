@@ -71,7 +71,8 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], weight of a reward one step later (the lecture is undiscounted: 1)"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (Algorithm 3, line 5), in units of reward"""
+    """V has converged when no V(s) changes by more in a sweep (Algorithm 3, line 5), in units of reward;
+    above 1e-9 it is also what makes a tie"""
     max_iterations: int = 100_000
     """sweeps after which to give up, an error"""
     output_json: Path | None = None
@@ -202,6 +203,8 @@ def mdp_from_json(model: dict) -> MDP:
         raise ValueError('"terminal" must be a list of states')
     states = list(dict.fromkeys([*transitions, *terminal]))
     start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
+    if not states:
+        raise ValueError("the model has no states")
     number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
     if unknown := [state for state in start if state not in number]:
         raise ValueError(f"unknown start state {unknown[0]!r}")
@@ -236,7 +239,11 @@ def mdp_from_json(model: dict) -> MDP:
     shape = (len(actions), len(states))
     P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
     # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R = sparse.csr_array((P.data * rewards, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+    R, size = (
+        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
+        for factor in (rewards, np.abs(rewards))
+    )
+    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
     return MDP(
         states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
         start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
@@ -349,9 +356,20 @@ def maximum(mdp: MDP, Q: np.ndarray) -> np.ndarray:
     return np.maximum.reduceat(Q, mdp.first_row)  # (S,)
 
 
+def slack(best: np.ndarray, tolerance: float) -> np.ndarray:
+    """(S,) How far below `best` (S,) still counts as equal: `tolerance` of that value's size where it is above 1.
+
+    Easy to get wrong: of the largest |Q| of all, one forbidden action at -1e9 would make ties of good and bad. (But
+    1e-11 of the largest value is what solving and summing leave of it everywhere.)
+    """
+    size = np.abs(best)  # (S,)
+    return np.maximum(tolerance * np.maximum(1.0, size), 1e-11 * size.max())
+
+
 def tied_rows(mdp: MDP, Q: np.ndarray, tolerance: float) -> np.ndarray:
-    """(rows,) bool: the actions that come within `tolerance` of the best of their state."""
-    return Q >= (maximum(mdp, Q) - max(1e-9, tolerance) * max(1.0, np.abs(Q).max()))[mdp.state_of_row]
+    """(rows,) bool: the actions that come within `tolerance`, or 1e-9 if that is more, of the best of their state."""
+    best = maximum(mdp, Q)  # (S,)
+    return Q >= (best - slack(best, max(1e-9, tolerance)))[mdp.state_of_row]
 
 
 def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
@@ -659,13 +677,14 @@ def main() -> None:
         V, Q, changes, history = value_iteration(mdp, args.discount, args.tolerance, args.max_iterations)
         tied = tied_rows(mdp, Q, args.tolerance)
         policy = greedy_policy(mdp, Q, tied, args.discount)
-        solution = Solution(V, Q, policy, tied, len(changes), changes[-1], changes, history)
+        residual = float(np.abs(maximum(mdp, backup(mdp, V, args.discount)) - V).max())
+        solution = Solution(V, Q, policy, tied, len(changes), residual, changes, history)
         if readable(mdp):
             print_value_tables(mdp, args.discount, history)
         print_solution(mdp, solution)
         if args.discount < 1:
-            # ‖V - V*‖ ≤ γ / (1 - γ) ‖V_i - V_i-1‖, for a backup is a contraction by γ
-            print(f"max |V - V*| <= {args.discount / (1 - args.discount) * solution.residual:.3g}")
+            # ‖V - V*‖ ≤ ‖V - T V‖ + ‖T V - T V*‖ ≤ residual + γ ‖V - V*‖, T a backup: the triangle inequality
+            print(f"max |V - V*| <= {residual / (1 - args.discount):.3g}")
         save_json(args.output_json, as_json(mdp, solution))
         save_figure(args.figure, mdp, {"Value iteration": solution}, "sweep i", "max |V_i - V_i-1|")
     except (ValueError, OSError) as error:

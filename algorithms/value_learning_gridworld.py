@@ -375,7 +375,8 @@ def optimal_action_values(P: sparse.csr_array, R: np.ndarray, discount: float, m
         previous, Q = Q, R + discount * (P @ Q.reshape(P.shape[1], -1).max(axis=1))  # (S·A,)
         if np.abs(Q - previous).max() <= 1e-13 * max(1, np.abs(Q).max()):
             return Q.reshape(P.shape[1], -1)
-    raise ValueError(f"Q* has not converged in {max_sweeps} sweeps: a discount below {discount} makes it finite")
+    hint = ": a discount below 1 makes it finite" if discount == 1 else ""
+    raise ValueError(f"Q* has not converged in {max_sweeps:,} sweeps{hint}")
 
 
 def greedy_actions(Q: np.ndarray, tolerance: float = 0.0) -> np.ndarray:
@@ -469,11 +470,12 @@ def draw_error(axes: Axes, history: list[Estimate], errors: list[float]) -> None
 
 def make_run_dir(runs_dir: Path, env_id: str, script: str, seed: int) -> Path:
     """Make the folder runs_dir/{env_id}__{script}__{seed}__{time}; a second one in the same second is numbered."""
-    name = f"{env_id.replace('/', '-')}__{script}__{seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    folders = itertools.chain([runs_dir / name], (runs_dir / f"{name}-{i}" for i in itertools.count(2)))
-    run_dir = next(folder for folder in folders if not folder.exists())
-    run_dir.mkdir(parents=True)
-    return run_dir
+    name = f"{env_id.replace('/', '-').replace(':', '-')}__{script}__{seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    runs_dir.mkdir(parents=True, exist_ok=True)
+    for run_dir in itertools.chain([runs_dir / name], (runs_dir / f"{name}-{i}" for i in itertools.count(2))):
+        with contextlib.suppress(FileExistsError):
+            run_dir.mkdir()
+            return run_dir
 
 
 # ---- main ----------------------------------------------------------------------------------------
@@ -497,6 +499,8 @@ def main() -> None:
             policy = greedy_actions(Q_star, 1e-9).argmax(axis=1)  # (S,)
         rows = np.arange(S) * A + policy  # (S,)
         V_pi = policy_values(P[rows], R[rows], args.discount, names)  # (S,)
+        if not args.policy and np.abs(V_pi - Q_star.max(axis=1))[acting].max() > 1e-6:
+            raise ValueError("of the best actions the first go round for ever: name a policy that ends, by --policy")
         start = acting if args.exploring_starts else world.initial_state_distrib  # (S,)
         reached = decision_states(P[rows], start)  # (S,)
         run_dir = make_run_dir(args.runs_dir, "GridWorld", "value_learning_gridworld", args.seed)

@@ -59,6 +59,20 @@ CANCELLING = {  # -1 and +1, round and round: the sums have no limit
     },
 }
 
+FORBIDDEN = {  # to do a3 ends in a fine of 1e9; beside it 1 and 1.5 are still not the same
+    "start": "s",
+    "terminal": ["goal"],
+    "transitions": {
+        "s": {"a1": [[1, "goal", 1]], "a2": [[1, "goal", 1.5]], "a3": [[1, "goal", -1e9]], "a4": [[1, "pit", 0]]},
+        "pit": {"out": [[1, "goal", -1e9]]},
+    },
+}
+FAIR_LOOP = {  # 0.1·3 - 0.3·1 is nothing, in floating point too
+    "start": "s",
+    "terminal": ["goal"],
+    "transitions": {"s": {"bet": [[0.1, "s", 3], [0.3, "s", -1], [0.6, "s", 0]], "out": [[1, "goal", -1]]}},
+}
+
 
 def run(module, monkeypatch, capsys, *flags):
     """A script's main in this process: (exit code, standard output, standard error)."""

@@ -5,7 +5,7 @@ import json
 import linear_program as script
 import numpy as np
 import pytest
-from known_mdps import CANCELLING, best_values, random_model, run, tables
+from known_mdps import CANCELLING, best_values, random_model, run, tables, written
 
 
 def test_the_lectures_mdp(monkeypatch, capsys, tmp_path):
@@ -77,3 +77,10 @@ def test_the_best_policy_with_a_value_where_rewards_cancel():
 def test_max_iterations_is_an_error(monkeypatch, capsys):
     code, _, err = run(script, monkeypatch, capsys, "--env-id", "FrozenLake-v1", "--max-iterations", 3)
     assert code == 2 and "HiGHS stopped without a solution (--max-iterations 3)" in err and err.count("\n") == 1
+
+
+def test_a_comparison_that_does_not_converge_costs_no_solution(monkeypatch, capsys, tmp_path):
+    flags = ["--mdp", written(tmp_path / "mdp.json", CANCELLING), "--figure", tmp_path / "figure.png"]
+    code, out, err = run(script, monkeypatch, capsys, *flags, "--output-json", tmp_path / "out.json")
+    assert (code, err) == (0, "") and "V has not converged after --max-iterations 100,000" in out
+    assert json.loads((tmp_path / "out.json").read_text())["values"] == {"s": -10, "t": -9, "goal": 0}

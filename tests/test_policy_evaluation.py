@@ -7,6 +7,7 @@ from fractions import Fraction
 import exhaustive_search
 import numpy as np
 import policy_evaluation as script
+import policy_iteration
 import pytest
 from known_mdps import BETTER_STAY, SCRIPTS, dense_values, random_model, run, sparse_mdp, tables, written
 from scipy import sparse
@@ -130,7 +131,7 @@ def test_large_systems_direct_and_iterative_agree(monkeypatch):
 def test_a_policy_that_never_ends(monkeypatch, capsys, tmp_path):
     path = written(tmp_path / "mdp.json", BETTER_STAY)
     code, out, err = run(script, monkeypatch, capsys, "--mdp", path, "--policy", "s=step t=back")
-    assert (code, err) == (0, "") and "V(s) = 0   (it never leaves, and every reward is 0)" in out
+    assert (code, err) == (0, "") and "V(s) = 0   (it never leaves, and expects a reward of 0)" in out
     model = {"start": "s", "terminal": ["goal"], "transitions": {
         "s": {"on": [[0.5, "t", 4], [0.5, "goal", 0]]},
         "t": {"on": [[1, "u", 0]], "out": [[1, "goal", 0]]},
@@ -210,6 +211,7 @@ BAD_MODELS = [
     ("[]", r"a model is"),
     ('{"start": "s0", "transitions": 3}', r"a model is"),
     ('{"start": ["s0"], "transitions": {"s0": {"a": [[1, "s0", 0]]}}}', r"unknown start state"),
+    ('{"start": {}, "transitions": {}}', r"the model has no states"),
     ("[" * 100_000, r"is not JSON"),
 ]
 
@@ -224,6 +226,13 @@ def test_bad_models_end_in_one_line(module, text, message, monkeypatch, capsys, 
     assert (code, out) == (2, "") and err.count("\n") == 1 and err.startswith("error: ")
     assert re.search(message, err), err
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("module", [script, policy_iteration], ids=lambda module: module.__name__)
+def test_probabilities_that_sum_to_1_only_by_rounding(module, monkeypatch, capsys, tmp_path):
+    model = {"start": "s", "terminal": ["g"], "transitions": {"s": {"a": [[1, "s", 0], [1e-12, "g", 1]]}}}
+    code, _, err = run(module, monkeypatch, capsys, "--mdp", written(tmp_path / "mdp.json", model))
+    assert code == 2 and err.count("\n") == 1 and "no single solution" in err
 
 
 @pytest.mark.parametrize("module", SCRIPTS, ids=lambda module: module.__name__)
