@@ -3,7 +3,8 @@
     python benchmarks/checkpoint.py
 
 The replay memory of dqn_atari.py is filled with frames of random play, copied as often as it takes, each copy an object
-of its own; the checkpoint holds what a run's does. Written to the folder for temporary files, fsync included.
+of its own; the checkpoint holds what a run's does. Written to the folder for temporary files, fsync included, and read
+again while the system still holds it in memory.
 """
 
 import dataclasses

@@ -6,7 +6,8 @@
 The same game, minibatch of 32, replay ratio, learning rate and interval of target copies, ε at 0.01, timed once
 learning is under way, on an otherwise idle machine. The two run in processes of their own that take turns, 100 frames
 each while the other waits: both see the same machine, whose speed may drift. dqn_atari.py is run whole, as its users
-run it; Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers. Both warm up for 1,000 frames without and
+run it, in bfloat16 where its --precision auto takes that; Stable-Baselines3's DQN, which has float32 only, with its
+CnnPolicy and its own Atari wrappers. Both on the CPU. Both warm up for 1,000 frames without and
 1,000 with learning. The floors are the bare emulator, four frames of it, and the update alone on a minibatch that is
 never changed.
 """
@@ -17,10 +18,12 @@ import dataclasses
 import multiprocessing
 import os
 import platform
+import queue
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -38,6 +41,8 @@ class Args:
     """Frames of each that are timed, at one update per frame and at one in four."""
     env_id: str = "PongNoFrameskip-v4"
     """The game."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """That of dqn_atari.py's training."""
 
 
 class Turns:
@@ -72,7 +77,8 @@ def ours(args: Args, update_frequency: int, turns: Turns) -> None:
     dqn.tqdm = Bar
     with tempfile.TemporaryDirectory() as folder:
         dqn.main(dqn.Args(
-            env_id=args.env_id, runs_dir=folder, environment_train_frames_max=WARM_UP + args.frames,
+            env_id=args.env_id, device="cpu", precision=args.precision, runs_dir=folder,
+            environment_train_frames_max=WARM_UP + args.frames,
             agent_replay_buffer_initial=1000, agent_update_frequency=update_frequency,
             agent_epsilon_greedy_annealing=1000, environment_test_frames=1))
 
@@ -96,7 +102,8 @@ def stable_baselines3(args: Args, update_frequency: int, turns: Turns) -> None:
     env = VecFrameStack(make_atari_env(args.env_id, n_envs=1, seed=1, env_kwargs=same_game), n_stack=4)
     model = DQN("CnnPolicy", env, learning_rate=1e-4, buffer_size=WARM_UP + args.frames, learning_starts=1000,
                 batch_size=32, train_freq=update_frequency, gradient_steps=1, target_update_interval=1000,
-                exploration_fraction=1000 / (WARM_UP + args.frames), exploration_final_eps=0.01, seed=1)
+                exploration_fraction=1000 / (WARM_UP + args.frames), exploration_final_eps=0.01, seed=1,
+                device="cpu")
     model.learn(WARM_UP + args.frames, callback=Clock())
 
 
@@ -114,9 +121,22 @@ def side_by_side(args: Args, update_frequency: int) -> dict[str, np.ndarray]:
     """Seconds of every turn of each."""
     processes = multiprocessing.get_context("spawn")
     first, second, results = processes.Semaphore(1), processes.Semaphore(0), processes.Queue()
-    for who, mine, theirs in ((ours, first, second), (stable_baselines3, second, first)):
-        processes.Process(target=run, args=(who, args, update_frequency, mine, theirs, results), daemon=True).start()
-    return {name: np.array(seconds) for name, seconds in (results.get(timeout=3600) for _ in range(2))}
+    children = [processes.Process(name=who.__name__, daemon=True, target=run,
+                                  args=(who, args, update_frequency, mine, theirs, results))
+                for who, mine, theirs in ((ours, first, second), (stable_baselines3, second, first))]
+    for child in children:
+        child.start()
+    found = {}
+    while len(found) < len(children):
+        try:
+            name, seconds = results.get(timeout=1)
+            found[name] = np.array(seconds)
+        except queue.Empty:
+            if failed := [child for child in children if child.exitcode]:  # the other would wait for it for ever
+                for child in children:
+                    child.kill()
+                raise SystemExit(f"error: {failed[0].name} ended with code {failed[0].exitcode}") from None
+    return found
 
 
 def milliseconds(call, repeats: int = 300) -> float:
@@ -134,7 +154,7 @@ def parts(args: Args) -> dict[str, float]:
     import ale_py
     import dqn_atari as dqn
 
-    script_args = dqn.Args(env_id=args.env_id)
+    script_args = dqn.Args(env_id=args.env_id, device="cpu", precision=args.precision)
     device, precision = dqn.choose_device(script_args)
     rng = np.random.default_rng(0)
     encode, decode = dqn.frame_encoding("lz4", 84, 84, device)
@@ -177,10 +197,14 @@ def parts(args: Args) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Print where a frame's time goes, then the two side by side."""
+    import dqn_atari as dqn
     import stable_baselines3  # noqa: F401  it is wanted later: its absence is to be known now
 
+    if args.frames < TURN:
+        raise SystemExit(f"error: --frames must be at least {TURN}, one turn")
+    _, precision = dqn.choose_device(dqn.Args(device="cpu", precision=args.precision))
     print(f"{args.env_id}, {os.cpu_count()} cores, {platform.machine()}, PyTorch {torch.__version__}, "
-          f"{torch.get_num_threads()} threads")
+          f"{torch.get_num_threads()} threads; dqn_atari.py in {str(precision).removeprefix('torch.')}")
     print(f"\n{'milliseconds a frame':<38}{'update every frame':>22}{'update every 4th':>22}")
     for name, value in parts(args).items():
         rare = value / 4 if name.startswith(("sample", "update")) else value

@@ -5,7 +5,8 @@
 The same transitions (random play), the same minibatches, the same initial weights: `updates` updates of dqn_atari.py in
 each precision, for each seed, θ⁻ copied at every 250th. What was learnt is judged in float32 on transitions that
 neither saw: the mean Huber loss against the targets of the network's own copy, and the mean of max Q. If the difference
-between the precisions is of the size of the difference between seeds, the precision is harmless here.
+between the precisions is of the size of the difference between seeds, the precision is harmless here. That says
+something only where the loss is below that of Q = 0, which is printed first: a network that has learnt nothing.
 """
 
 import copy
@@ -26,7 +27,7 @@ class Args:
     transitions: int = 10_000
     """Transitions of random play to learn from; another tenth is held out."""
     updates: int = 2_000
-    """Updates in each precision."""
+    """Updates in each precision, 5 or more."""
     seeds: int = 3
     """Initial weights and orders of minibatches."""
 
@@ -65,6 +66,8 @@ def learn(args: Args, seed: int, precision: torch.dtype, memory, num_actions: in
 
 def main(args: Args) -> None:
     """Print one row per fifth: the mean over seeds, and the standard deviation over seeds in brackets."""
+    if args.updates < 5 or args.seeds < 2:
+        raise SystemExit("error: --updates must be at least 5, --seeds at least 2")
     total = args.transitions + args.transitions // 10
     env, memory, _ = play(args.game, total, total)
     results = {precision: np.array([learn(args, seed, precision, memory, int(env.action_space.n))
@@ -72,8 +75,10 @@ def main(args: Args) -> None:
                for precision in (torch.float32, torch.bfloat16)}
     print(f"{args.game}, {args.seeds} seeds, held-out transitions\n")
     print(f"{'updates':>8}{'Huber loss, float32':>26}{'bfloat16':>24}{'max Q, float32':>24}{'bfloat16':>22}")
+    silent = 0.5 * np.square(memory.rewards[args.transitions :]).mean()  # rewards of at most 1: the square part
+    print(f"{'Q = 0':>8}{silent:>26.5f}{silent:>24.5f}{0:>24.5f}{0:>22.5f}")
     for k in range(5):
-        cells = [f"{values[:, k, column].mean():.5f} ({values[:, k, column].std():.5f})"
+        cells = [f"{values[:, k, column].mean():.5f} ({values[:, k, column].std(ddof=1):.5f})"
                  for column in range(2) for values in results.values()]
         print(f"{args.updates // 5 * (k + 1):>8}{cells[0]:>26}{cells[1]:>24}{cells[2]:>24}{cells[3]:>22}")
 

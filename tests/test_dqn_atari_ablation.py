@@ -21,7 +21,7 @@ import torch
 from conftest import ALGORITHMS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_dqn_atari import BREAKOUT, same, weights
-from test_dqn_atari_resume import plain, posix, stop_at
+from test_dqn_atari_resume import plain, posix, stop_at, wait_for_the_next_second
 
 SHORT = dict(device="cpu", environment_train_frames_max=400, agent_replay_buffer_initial=100,
              agent_replay_buffer_maximum_length=150, optimizer_minibatch_size=32, agent_update_frequency=8,
@@ -343,6 +343,7 @@ def test_a_study_skips_what_is_finished_and_resumes_what_was_cut_off(study, tmp_
 def test_auto_trains_the_longest_run_on_to_the_frames_that_are_asked_for(tmp_path):
     """Also where that number is the default, which a study leaves out of its commands: sys.argv is empty here."""
     longest = run(tmp_path, environment_train_frames_max=150)
+    wait_for_the_next_second(longest)
     newest = run(tmp_path, environment_train_frames_max=120)
     assert newest != longest
     run(tmp_path, environment_train_frames_max=200, resume="auto")
@@ -353,8 +354,9 @@ def test_auto_trains_the_longest_run_on_to_the_frames_that_are_asked_for(tmp_pat
 @posix
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_to_the_study_stops_its_run_with_a_checkpoint(signum, tmp_path):
-    process = subprocess.Popen([sys.executable, ALGORITHMS / "dqn_atari_ablation.py", "--study", "initialization"],
-                               cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    few = ["--environment-train-frames-max", "100000", "--environment-test-frames", "1"]  # should it be left behind
+    command = [sys.executable, ALGORITHMS / "dqn_atari_ablation.py", "--study", "initialization", *few]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         for line in process.stdout:
             if line.startswith("run      "):
