@@ -157,7 +157,10 @@ def apart(what: str, limit: float, function, *arguments):
     """The function's result, computed in a process of its own; None after `limit` seconds or for want of memory."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         try:
-            return pool.apply_async(function, arguments).get(limit)
+            result = pool.apply_async(function, arguments).get(limit)
+            pool.close()
+            pool.join()
+            return result
         except (multiprocessing.TimeoutError, MemoryError) as error:
             return print(f"  {what}: given up, {type(error).__name__} ({limit:g} s allowed)", flush=True)
 
