@@ -13,8 +13,8 @@ Run it
 Measured
     The first command ends at i = 2 with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1: V(0) =
     0.823529411765 (14/17) after 8 iterations. Taxi-v3 at discount 1 begins with a policy that never ends and
-    finishes with a mean V of 7.93. 10^4, 10^5 and 10^6 random states with 4 actions take 0.02, 0.27 and 6.2 s;
-    QuantEcon's was given up after 60 s on the smallest (benchmarks/known_mdps.py --limit 60, two CPU cores).
+    finishes with a mean V of 7.93. 10^4, 10^5 and 10^6 random states with 4 actions take 0.04, 0.33 and 7.4 s;
+    QuantEcon's was given up after 40 s on the smallest (benchmarks/known_mdps.py --limit 40, two CPU cores).
 
 Deviations
     lecture                      this file                                why

@@ -13,8 +13,8 @@ Run it
 Measured
     The first command ends after 5 sweeps with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1:
     V(0) = 0.823529411742 (exactly 14/17) after 994 sweeps. On 10^6 states (20 transitions each, discount 0.95) a
-    sweep takes 82.1 ms and a whole solve 26.4 s, QuantEcon's 89.9 ms and 26.8 s; on 10^5 6.79 ms and 1.24 s against
-    9.55 ms and 2.74 s (benchmarks/known_mdps.py, two CPU cores).
+    sweep takes 58.8 ms and a whole solve 18.6 s, QuantEcon's 67.3 ms and 24.7 s; on 10^5 4.11 ms and 1.52 s against
+    5.48 ms and 1.54 s (benchmarks/known_mdps.py, two CPU cores).
 
 Deviations
     lecture                     this file                                why
