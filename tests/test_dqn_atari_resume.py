@@ -286,7 +286,7 @@ def test_thirty_kills_while_checkpointing_lose_nothing(tmp_path):
         saved = checkpoint.exists()
         if saved:
             frames.add(dqn.load_checkpoint(checkpoint)[0]["counters"]["frames"])  # whole, whatever the moment
-    print(sorted(frames))
+    assert len(frames) >= 2, frames  # the children got somewhere before they were killed
     _, run_dir = run(folder, resume=checkpoint.parent) if saved else run(tmp_path / "again", **flags)
     assert everything(run_dir) == everything(expected)
 
