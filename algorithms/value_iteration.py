@@ -683,7 +683,7 @@ def main() -> None:
             print_value_tables(mdp, args.discount, history)
         print_solution(mdp, solution)
         if args.discount < 1:
-            # ‖V - V*‖ ≤ ‖V - T V‖ + ‖T V - T V*‖ ≤ residual + γ ‖V - V*‖, T a backup: the triangle inequality
+            # ‖V - V*‖ ≤ ‖V - T V‖ + ‖T V - T V*‖ ≤ residual + γ ‖V - V*‖, T a backup: it contracts by γ
             print(f"max |V - V*| <= {residual / (1 - args.discount):.3g}")
         save_json(args.output_json, as_json(mdp, solution))
         save_figure(args.figure, mdp, {"Value iteration": solution}, "sweep i", "max |V_i - V_i-1|")

@@ -7,9 +7,8 @@ The same game, minibatch of 32, replay ratio, learning rate and interval of targ
 learning is under way, on an otherwise idle machine. The two run in processes of their own that take turns, 100 frames
 each while the other waits: both see the same machine, whose speed may drift. dqn_atari.py is run whole, as its users
 run it, in bfloat16 where its --precision auto takes that; Stable-Baselines3's DQN, which has float32 only, with its
-CnnPolicy and its own Atari wrappers. Both on the CPU. Both warm up for 1,000 frames without and
-1,000 with learning. The floors are the bare emulator, four frames of it, and the update alone on a minibatch that is
-never changed.
+CnnPolicy and its own Atari wrappers. Both run on the CPU and warm up for 1,000 frames without and 1,000 with learning.
+The floors are the bare emulator, four frames of it, and the update alone on a minibatch that is never changed.
 """
 
 import contextlib
