@@ -20,8 +20,8 @@ Run it
     python algorithms/tabular_q_gridworld.py --env-id FrozenLake-v1 --env-kwargs is_slippery=false
     tensorboard --logdir runs
 
-Measured
-    TODO
+Measured, by `python benchmarks/gridworld.py seeds`
+    200,000 episodes: Figure 10's policy for 20 of 20 seeds, with max |Q - Q*| from 0.006 to 0.028.
 
 Deviations from the lecture
     Step reward   -0.025. The lecture's rewards are in lost pictures. Its Figure 10 is optimal,
