@@ -1,96 +1,47 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "matplotlib>=3.9", "numpy>=1.26",
-#     "opencv-python-headless", "psutil", "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
+#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
+#     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
-r"""Deep Q-Learning on Atari games, taken apart: Tables 4, 5 and 6 of the lecture (ECE 544NA, Lecture 27, §7.5), the
-method of Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), [8]
-below. This is dqn_atari.py and the experiment; `diff dqn_atari.py dqn_atari_ablation.py` shows the experiment and what
-runs and tabulates its arms.
+r"""Deep Q-Learning on Atari games, taken apart (ECE 544NA, Lecture 27, §7.5, Tables 4 and 6):
+dqn_atari.py with three switches; `diff dqn_atari.py dqn_atari_ablation.py` shows them.
 
-    --initialization default|he|orthogonal   weights of the convolutions (Table 4); all else stays PyTorch's default
-    --no-target-network                      bootstrap from the online network: θ⁻ = θ after every update; still no
-                                             gradient passes through the bootstrap (Table 6)
-    --no-replay-buffer                       the minibatch is the optimizer_minibatch_size most recent transitions, in
-                                             order (Table 6). The lecture does not say how it did this. Everything else
-                                             is unchanged: the random frames before learning starts, the update
-                                             frequency, the minibatch's size
-With none of the three a run is bit for bit that of dqn_atari.py with the same --env-id.
+    --initialization default|he|orthogonal   convolution weights (Table 4)
+    --no-target-network                      θ⁻ is θ itself; still no gradient passes through y
+    --no-replay-buffer                       ℬ is the last transitions, in their order
+
+With none of them a run is bit for bit that of dqn_atari.py with the same --env-id.
+evaluations.csv has one column more: the mean, over 500 held-out states, of the greatest Q. It is
+what runs away without a target network.
 
 Run it
-    python algorithms/dqn_atari_ablation.py --no-target-network                     # one arm; Breakout, Table 3
-    python algorithms/dqn_atari_ablation.py --study ablation --seeds 3              # Table 6, one run after another
-    python algorithms/dqn_atari_ablation.py --study games --seeds 3 --list          # Table 5's commands, for a cluster
-    python algorithms/dqn_atari_ablation.py --table runs --figure curves.png        # what has been measured so far
-The same --study command goes on where it was cut off. Each command of --list does that too, for its own run.
+    python algorithms/dqn_atari_ablation.py --no-target-network     # one arm, on Breakout
+    python benchmarks/study.py ablation --seeds 3                   # all of Table 6
+    python benchmarks/study.py tables                               # Tables 4 to 6 so far
 
-Measured (2 cores of an AMD EPYC, PyTorch 2.13)
-    python algorithms/dqn_atari_ablation.py --study ablation --environment-train-frames-max 600 \
-        --agent-replay-buffer-initial 200 --agent-update-frequency 4 --environment-evaluation-interval-episodes 4 \
-        --environment-evaluation-episodes 1 --environment-test-frames 600
-    A quarter of a minute an arm, too short to learn anything but what diverges. Mean max Q of the held-out states after
-    80 updates: 0.052 with both parts, 0.098 without replay buffer, 6.0 without target network, 7.6 without either.
+Measured
+    MEASURED
 
 Deviations
-    lecture or paper                        this file                              why
-    --------------------------------------  -------------------------------------  ------------------------------------
-    Algorithm 6 copies θ to θ⁻ by episodes  every 1,000 frames, every 500          Table 3 says so; the two disagree
-    and evaluates by frames                 episodes
-    squared error (Algorithm 6, line 22)    Huber loss                             §5.3: [8] clips the error's gradient;
-                                                                                   so does this file
-    [8] acts at random until learning       ε is annealed from the first frame     Algorithm 6, lines 10-13
-    starts
-    [8]: biases and weights uniform         orthogonal convolution filters,        §7.5.1: the best of Table 4
-                                            PyTorch's default elsewhere
-    [8]: a state begins with empty frames   a state begins with copies of the      one rule for acting and replay; no
-                                            episode's first frame                  frame that was never on the screen
-    [8]: 1 to 30 no-ops                     0 to 30 no-ops, in emulator frames     §7.2.1: "maximum number"
-    32-bit arithmetic                       bfloat16 while training, on x86 CPUs   speed; the weights θ, the head, Adam
-                                            that have it (--precision)             and evaluation stay 32-bit
-    raw frames, shared by reference         LZ4-compressed frames, by reference    0.4 to 1.4 GB instead of 11 GB
-    [8]: FIRE may be part of any action     four directions, FIRE when centred     §7.3.3
-    [8] released: θ⁻ copied every 10,000    Figure 18's 10,000 updates, 40,000     the lecture's table counts updates
-    frames, area-averaged screens, ties     frames; bilinear screens; the first    §7.2.1 says bilinear; float ties
-    broken at random, lives looked at       of tied actions; lives looked at       are rare; one transformation, one
-    every emulator frame                    every frame                            wrapper
-    no replay: not described                minibatch = the last transitions       Table 6 needs a rule; this one
-                                                                                   changes the memory, nothing else
-    mean max Q: not reported                of 500 held-out states, at every       it shows what diverges without a
-                                            evaluation                             target network
-    one run per arm                         --seeds; from three up, interquartile  one run of each is an anecdote
-                                            mean and 95% bootstrap interval
+    The lecture does not say what "no replay buffer" trains on. Here it is the most recent
+    transitions, as many as a minibatch holds; everything else stays, the random frames before
+    learning starts, too. All other deviations are those of dqn_atari.py.
 """
 
-from __future__ import annotations
-
-import contextlib
 import copy
-import csv
 import dataclasses
-import difflib
-import functools
-import inspect
-import io
-import itertools
 import json
 import math
-import operator
-import os
-import platform
-import re
-import shlex
 import signal
-import subprocess
 import sys
-import textwrap
-import threading
 import time
+import timeit
 import zipfile
-from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn, TypeVar
+from typing import Literal
 
 import ale_py
 import cv2
@@ -98,214 +49,138 @@ import filelock
 import gymnasium as gym
 import lz4.block
 import numpy as np
-import psutil
 import torch
-import torch.nn.functional as F
 import tyro
-from matplotlib.figure import Figure
+from gymnasium.wrappers import ClipReward, RecordEpisodeStatistics, TransformObservation
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-Flags = TypeVar("Flags")
+REPORT_INTERVAL = 2_000  # frames between two points of a curve
 
-LOG_INTERVAL = 500  # frames between two points of a curve, rounded up to a frame that has an update
-CHECKPOINT_FORMAT = "dqn_atari checkpoint 1"
-Q_NETWORK_FORMAT = "dqn_atari q_network 1"
-HELD_OUT_STATES = 500
-HELD_OUT_INTERVAL = 10  # frames of random play from one held-out state to the next
-
-
-# ---- Args ------------------------------------------------------------------------------------------
+# ---- Args ----------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass
 class Args:
-    """One unit of time: a FRAME is a frame that the agent observes = one action of the agent = `agent_action_repeat`
-    (4) emulator frames. An EPISODE is one life while training; a GAME ends with the last life. The flags down to
-    `optimizer_learning_rate` are Table 3, in its order and with its values."""
+    """A FRAME is what the agent observes: one action, 4 emulator frames. Every count is in frames.
+    An EPISODE is one life while training; a GAME ends with the last life."""
 
+    # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
-    """Frames to train for [Table 3; 50,000,000 in the paper]."""
+    """frames to train for [8: 50,000,000]"""
     environment_evaluation_episodes: int = 10
-    """Games that one evaluation plays [Table 3]."""
+    """games of an evaluation"""
     environment_evaluation_interval_episodes: int = 500
-    """Episodes between evaluations [Table 3]."""
+    """episodes between evaluations"""
     environment_checkpoint_interval_episodes: int = 500
-    """Episodes between checkpoints [Table 3]."""
+    """episodes between two writings of q_network.pt"""
     environment_no_op_max: int = 30
-    """At most this many no-operations, in emulator frames, before the agent may act in a new game [Table 3]."""
+    """a game starts with up to this many no-operations, in emulator frames"""
     environment_reward_clip_limit: float = 1.0
-    """While training, the reward of a frame is clipped to [-limit, limit] [Table 3]."""
+    """while training, rewards are clipped to [-limit, limit]"""
     environment_frames_to_maxpool: int = 2
-    """Most recent emulator frames whose pixelwise maximum is the screen [Table 3]."""
+    """last emulator frames whose pixelwise maximum is the screen"""
     environment_state_height: int = 84
-    """Height of a frame given to the network, pixels [Table 3]."""
+    """height of a frame, pixels"""
     environment_state_width: int = 84
-    """Width of a frame given to the network, pixels [Table 3]."""
+    """width of a frame, pixels"""
     agent_history_length: int = 4
-    """Most recent frames in a state [Table 3]."""
+    """frames in a state"""
     agent_action_repeat: int = 4
-    """Emulator frames for which an action is repeated [Table 3]."""
+    """emulator frames for which an action is repeated"""
     agent_update_frequency: int = 1
-    """Actions (frames) from one optimization iteration to the next [Table 3; 4 in the paper]."""
+    """actions from one update to the next [8: 4]"""
     agent_discount_factor: float = 0.99
-    """γ, discount factor of a frame [Table 3, Equation 37]."""
+    """γ of a frame"""
     agent_epsilon_greedy_epsilon_initial: float = 1.0
-    """ε_initial, probability of a random action at frame 0 [Table 3]."""
+    """ε, probability of a random action, at frame 0"""
     agent_epsilon_greedy_epsilon_final: float = 0.01
-    """ε_final, the same once annealed [Table 3; 0.1 in the paper]."""
+    """ε once annealed [8: 0.1]"""
     agent_epsilon_greedy_annealing: int = 1_000_000
-    """Frames over which ε goes linearly from ε_initial to ε_final [Table 3]."""
+    """frames over which ε falls linearly"""
     agent_epsilon_greedy_epsilon_evaluation: float = 0.05
-    """ε while evaluating [Table 3]."""
+    """ε while evaluating"""
     agent_replay_buffer_initial: int = 100_000
-    """Transitions in the replay memory before learning starts [Table 3; 50,000 in the paper]."""
+    """transitions in the replay memory before learning starts [8: 50,000]"""
     agent_replay_buffer_maximum_length: int = 1_000_000
-    """N, transitions that the replay memory 𝒟 holds; the oldest give way [Table 3]."""
+    """transitions that the replay memory holds; the oldest give way"""
     optimizer_name: Literal["Adam", "RMSprop"] = "Adam"
-    """Adam [Table 3], or the released RMSProp of the paper: centred, its constant inside the root, no momentum."""
+    """Adam, or the RMSProp of [8] with the constants of Figure 18"""
     optimizer_minibatch_size: int = 32
-    """Transitions in a minibatch ℬ [Table 3]."""
+    """transitions in a minibatch"""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
-    """C, frames between copies of θ to the target network θ⁻ [Table 3; 10,000 updates = 40,000 frames in the paper]."""
+    """frames between copies of θ to the target network [8: 10,000 updates = 40,000 frames]"""
     optimizer_learning_rate: float = 0.0001
-    """Learning rate [Table 3; 0.00025 in the paper]."""
+    """learning rate [8: 0.00025]"""
 
+    # This script's own
     initialization: Literal["default", "he", "orthogonal"] = "orthogonal"
-    """Weights of the convolutions: PyTorch's default, He-normal or orthogonal [Table 4]."""
+    """weights of the convolutions; everything else stays PyTorch's default [Table 4]"""
     target_network: bool = True
-    """Bootstrap from θ⁻, copied every C frames; without it θ⁻ = θ after every update [Table 6]."""
+    """whether y is computed with θ⁻, a copy, or with θ itself [Table 6]"""
     replay_buffer: bool = True
-    """Draw ℬ uniformly from 𝒟; without it ℬ is the most recent transitions, in order [Table 6]."""
-    study: Literal["", "initialization", "ablation", "games"] = ""
-    """Run all the arms of Table 4, Table 6 or Table 5, one after another; what is finished is skipped."""
-    seeds: int = 1
-    """Runs of each of a study's arms, with the seeds from --seed up."""
-    list: bool = False
-    """Print a study's commands, one run a line, instead of running them."""
-    table: str = ""
-    """A folder: print Tables 4, 5 and 6 as far as the test.json files below it go, beside the lecture's figures."""
-    markdown: bool = False
-    """Print the tables as Markdown instead of text."""
-    figure: str = ""
-    """A file to draw the learning curves of --table's folder in: .png, .pdf or .svg."""
-
+    """whether a minibatch is drawn from all transitions, or is the last ones [Table 6]"""
     env_id: str = "BreakoutNoFrameskip-v4"
-    """The game: any of Gymnasium's Atari names, PongNoFrameskip-v4 or ALE/Pong-v5; both mean the same here."""
+    """game, by any of its Gymnasium names; PongNoFrameskip-v4 and ALE/Pong-v5 mean the same here"""
     seed: int = 1
-    """Seed of the weights, the exploration, the minibatches, the no-operations and the evaluations."""
-    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Where the network lives; auto takes an accelerator if PyTorch sees one."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Arithmetic while training; auto takes bfloat16 on an x86 CPU that multiplies it, float32 elsewhere."""
+    """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """Frames of the final test, in which only finished games count [§7.3.3]."""
-    optimizer_gradient_momentum: float = 0.95
-    """RMSprop only: decay of the mean gradient that centres it [Figure 18]."""
-    optimizer_squared_gradient_momentum: float = 0.95
-    """RMSprop only: decay of the mean squared gradient [Figure 18]."""
-    optimizer_min_squared_gradient: float = 0.01
-    """RMSprop only: constant added inside the root [Figure 18]."""
-    replay_encoding: Literal["auto", "lz4", "raw", "tensor"] = "auto"
-    """How a frame is kept: LZ4 bytes, a raw array, or a tensor on the device; auto takes tensor where an accelerator
-    has room for it, else lz4."""
+    """frames of the final test, and the most of an evaluation [§7.3.3]"""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """of the network; auto is CUDA if there is one, else the CPU"""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """of an update's layers; auto times both and takes the quicker"""
+    threads: int = 0
+    """CPU threads of PyTorch; 0 is PyTorch's own choice"""
     checkpoint_interval_minutes: float = 10.0
-    """Minutes after which a checkpoint is written even if no interval of episodes has passed."""
+    """minutes between checkpoints, which hold everything"""
     resume: str = ""
-    """A run directory to go on with; its own flags hold, only --environment-train-frames-max may be raised. auto: the
-    run with these very flags in --runs-dir, or a new one if there is none."""
+    """run directory to go on with; only --environment-train-frames-max may be raised"""
     runs_dir: str = "runs"
-    """Folder that the run directory is made in."""
+    """folder for the run directory"""
 
 
-def fail(message: str) -> NoReturn:
-    """Bad input: one line on standard error, exit code 2."""
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(2)
+def read_args() -> Args:
+    """The flags, or those of the run to resume. Exits with one line where no run can use them."""
+    args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+    if args.resume:
+        try:
+            saved = Args(**json.loads((Path(args.resume) / "args.json").read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise SystemExit(f"error: {args.resume} is no run directory: {error}") from None
+        args = tyro.cli(Args, default=saved)
+        changed = {name for name, value in vars(args).items() if value != getattr(saved, name)}
+        if not changed <= {"resume", "environment_train_frames_max"}:
+            raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
+    for name, value in vars(args).items():
+        share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
+        low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
+        if type(value) in (int, float) and not low <= value <= (1 if share else math.inf):
+            raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
+    if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
+        raise SystemExit("error: --agent-replay-buffer-initial is above the maximum length")
+    return args
 
 
-def parse_args(args_class: type[Flags]) -> Flags:
-    """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
-            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
-    box = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
-    except SystemExit as stop:
-        if stop.code != 2:
-            raise
-        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
-        fail(" ".join(itertools.takewhile(lambda line: not line.startswith(("─", "╰")), lines)) + " (see --help)")
-
-
-def flag(name: str) -> str:
-    """The command-line spelling of a field of Args."""
-    return "--" + name.replace("_", "-")
-
-
-def check_args(args: Args) -> None:
-    """Raise ValueError, with the flag's name, for a value that no run can use."""
-    numbers = {name: value for name, value in vars(args).items() if type(value) in (int, float)}
-    for name, value in numbers.items():
-        if "epsilon_greedy_epsilon" in name or "momentum" in name or name == "agent_discount_factor":
-            good, demand = 0 <= value <= 1, "lie between 0 and 1"
-        elif name in ("environment_state_height", "environment_state_width"):
-            good, demand = value >= 36, "be at least 36, which three strided convolutions need"
-        elif name in ("seed", "environment_no_op_max"):
-            good, demand = 0 <= value < 2**63, "be at least 0 and below 2^63"
-        else:
-            good, demand = 0 < value < math.inf, "be above 0 and finite"
-        if not good:
-            raise ValueError(f"{flag(name)} must {demand}, not {value}")
-    for small, large in (("optimizer_minibatch_size", "agent_replay_buffer_initial"),
-                         ("agent_replay_buffer_initial", "agent_replay_buffer_maximum_length")):
-        if numbers[small] > numbers[large]:
-            raise ValueError(f"{flag(small)} {numbers[small]} must not be above {flag(large)} {numbers[large]}")
-    for name, available in (("cuda", torch.cuda.is_available()), ("mps", torch.backends.mps.is_available())):
-        if args.device == name and not available:
-            raise ValueError(f"--device {name}: this PyTorch sees no such device; use --device auto or --device cpu")
-
-
-def check_ablation_args(args: Args) -> None:
-    """check_args, and this script's own. Raises ValueError."""
-    check_args(args)
-    for name, needed in (("seeds", "study"), ("list", "study"), ("markdown", "table"), ("figure", "table")):
-        if getattr(args, name) != getattr(Args, name) and not getattr(args, needed):
-            raise ValueError(f"{flag(name)} needs {flag(needed)}")
-    if args.table and args.study:
-        raise ValueError("--table and --study are two commands")
-    if args.figure and Path(args.figure).suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--figure {args.figure}: the name must end in .png, .pdf or .svg")
-    if args.study and args.resume:
-        raise ValueError("--study resumes by itself what was cut off; leave out --resume")
-    for name in STUDIES[args.study][0] if args.study else ():
-        if getattr(args, name) != getattr(Args, name):
-            raise ValueError(f"--study {args.study} sets {flag(name)} itself, arm by arm")
-
-
-# ---- problem: the Atari environment and its wrappers -----------------------------------------------
+# ---- problem: the Atari environment and its wrappers ---------------------------------------------
 #
-#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12      60 a second
-#   action           a₁ ────────  a₂ ────────  a₃ ───────    repeated 4 times, rewards summed
-#   max-pool               3∨4         7∨8       11∨12       of the last two: some sprites are drawn every other frame
-#   frame          x₀       x₁          x₂          x₃       grey, 84×84: what the agent observes, its unit of time
+#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12   60 a second
+#   action           a₁ ────────  a₂ ────────  a₃ ─────── repeated 4 times, rewards summed
+#   max-pool               3∨4         7∨8       11∨12    some sprites are drawn every other frame
+#   frame          x₀       x₁          x₂          x₃    grey, 84×84: the agent's unit of time
 #   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions without diagonals and without FIRE off centre (§7.3.3): a subset of NOOP, FIRE, UP,
-    RIGHT, LEFT, DOWN. `meanings` names them."""
+    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3): `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
         minimal = env.unwrapped.get_action_meanings()
-        self.meanings = [name for name in minimal if name in ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")]
+        joystick = ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")
+        self.meanings = [name for name in minimal if name in joystick]
         self.indices = [minimal.index(name) for name in self.meanings]
-        if len(self.meanings) < 2:
-            raise ValueError(f"{env.unwrapped.spec.id} cannot be played with four directions and FIRE when centred")
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
     def action(self, action: int) -> int:
@@ -313,93 +188,45 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A new game starts with 0 to `no_op_max` no-operations, emulator frames, drawn from `rng` (§7.2.1); with none in
-    the few games that have no NOOP."""
+    """A game starts with 0 to `no_op_max` no-operations, emulator frames, from `rng` (§7.2.1)."""
 
-    def __init__(self, env: JoystickActions, no_op_max: int, rng: np.random.Generator):
+    def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
-        self.no_op = env.meanings.index("NOOP") if "NOOP" in env.meanings else None
-        self.no_op_max, self.rng = no_op_max if self.no_op is not None else 0, rng
+        self.no_op_max, self.rng = no_op_max, rng
 
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, terminated, truncated, info = self.env.step(self.no_op)
-            if terminated or truncated:
-                screen, info = self.env.reset()
+            screen, _, _, _, info = self.env.step(0)
         return screen, info
-
-
-class MaxPool(gym.Wrapper):
-    """The screen is the pixelwise maximum, per colour, of the last `length` emulator frames (§7.2.1)."""
-
-    def __init__(self, env: gym.Env, length: int):
-        super().__init__(env)
-        self.screens = deque(maxlen=length)  # each (210, 160, 3) uint8
-
-    def reset(self, **kwargs):
-        screen, info = self.env.reset(**kwargs)
-        self.screens.clear()
-        self.screens.append(screen)
-        return screen, info
-
-    def step(self, action: int):
-        screen, reward, terminated, truncated, info = self.env.step(action)
-        self.screens.append(screen)
-        return functools.reduce(np.maximum, self.screens), reward, terminated, truncated, info  # (210, 160, 3) uint8
 
 
 class ActionRepeat(gym.Wrapper):
-    """An action lasts `repeat` emulator frames, or until the game ends; its rewards are summed (§7.2.1)."""
+    """An action lasts `repeat` emulator frames, or until the game ends; its rewards are summed, and
+    the pixelwise maximum of the last `pool` screens is the screen, colour by colour (§7.2.1)."""
 
-    def __init__(self, env: gym.Env, repeat: int):
+    def __init__(self, env: gym.Env, repeat: int, pool: int):
         super().__init__(env)
-        self.repeat = repeat
+        self.repeat, self.pool = repeat, pool
 
     def step(self, action: int):
-        total_reward = 0.0
+        total_reward, screens = 0.0, []
         for _ in range(self.repeat):
             screen, reward, terminated, truncated, info = self.env.step(action)
             total_reward += reward
+            screens.append(screen)  # (210, 160, 3) uint8
             if terminated or truncated:
                 break
+        screen = np.maximum.reduce(screens[-self.pool :])  # (210, 160, 3) uint8
         return screen, total_reward, terminated, truncated, info
 
 
-class Greyscale(gym.ObservationWrapper):
-    """Colour to luminance, 0.299 R + 0.587 G + 0.114 B (§7.2.1)."""
-
-    def observation(self, screen: np.ndarray) -> np.ndarray:
-        return cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY)  # (210, 160) uint8
-
-
-class Downsample(gym.ObservationWrapper):
-    """Bilinear downsampling to `height` × `width` (§7.2.1)."""
-
-    def __init__(self, env: gym.Env, height: int, width: int):
-        super().__init__(env)
-        self.height, self.width = height, width
-
-    def observation(self, screen: np.ndarray) -> np.ndarray:
-        return cv2.resize(screen, (self.width, self.height), interpolation=cv2.INTER_LINEAR)  # (84, 84) uint8
-
-
-class RewardClip(gym.Wrapper):
-    """The reward is clipped to [-limit, limit]; the game's own stays in info["raw_reward"] (§7.2.1, training only)."""
-
-    def __init__(self, env: gym.Env, limit: float):
-        super().__init__(env)
-        self.limit = limit
-
-    def step(self, action: int):
-        frame, reward, terminated, truncated, info = self.env.step(action)
-        return frame, min(max(reward, -self.limit), self.limit), terminated, truncated, info | {"raw_reward": reward}
-
-
 class LifeLoss(gym.Wrapper):
-    """A lost life terminates the episode, and the game goes on (§7.2.1, training only). info["game_over"] tells a
-    game's end from a life's. Easy to get wrong: after a lost life reset() returns the very frame that the episode ended
-    with. If it reset the emulator, the later lives would never be seen; if it stepped, a frame would be missed."""
+    """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
+
+    Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
+    it reset the emulator, the later lives would never be seen; if it stepped, a frame would be.
+    """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -415,234 +242,161 @@ class LifeLoss(gym.Wrapper):
         self.frame, reward, terminated, truncated, self.info = self.env.step(action)
         life_lost = self.info["lives"] < self.lives
         self.lives, self.game_over = self.info["lives"], terminated or truncated
-        self.info["game_over"] = self.game_over
         return self.frame, reward, terminated or life_lost, truncated, self.info
 
 
 class FrameHistory(gym.Wrapper):
-    """The state: references to the last `length` encoded frames, oldest first (§7.3.2). A frame is encoded once, when
-    it arrives, and never changed; acting and replay decode the same objects. An episode starts with `length` references
-    to its first frame."""
+    """The state: references to the last `length` frames, oldest first, as LZ4 bytes (§7.3.2). A
+    frame is compressed once, when it arrives. An episode's first state repeats its first frame."""
 
-    def __init__(self, env: gym.Env, length: int, encode):
+    def __init__(self, env: gym.Env, length: int):
         super().__init__(env)
-        self.length, self.encode = length, encode
+        self.length = length
 
     def reset(self, **kwargs):
         frame, info = self.env.reset(**kwargs)
-        self.history = (self.encode(frame),) * self.length
+        self.history = (lz4.block.compress(frame),) * self.length
         return self.history, info
 
     def step(self, action: int):
         frame, reward, terminated, truncated, info = self.env.step(action)
-        self.history = (*self.history[1:], self.encode(frame))
+        self.history = (*self.history[1:], lz4.block.compress(frame))
         return self.history, reward, terminated, truncated, info
 
 
-def make_emulator(env_id: str) -> gym.Env:
-    """The bare game at 60 frames a second: nothing skipped, no action repeated at random, truncated after 108,000
-    emulator frames. Raises ValueError for a name that is no Atari game."""
-    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.Env:
+    """The game with the transformations of Figure 16 (training) or 17 (without the last `if`).
+
+    Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
+    Exits with one line for a name that is no Atari game.
+    """
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
     gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
-    games = [name for name, spec in gym.registry.items() if spec.entry_point == "ale_py.env:AtariEnv"]
-    if env_id not in games:
-        if env_id in gym.registry:
-            raise ValueError(f"{env_id} is no Atari game")
-        near = difflib.get_close_matches(env_id, games, n=3, cutoff=0.5)
-        raise ValueError(f"unknown game {env_id!r}" + (f"; near names: {', '.join(near)}" if near else ""))
-    return gym.make(env_id, frameskip=1, repeat_action_probability=0.0, full_action_space=False,
-                    max_num_frames_per_episode=108_000, disable_env_checker=True)
-
-
-def preprocess(env: gym.Env, args: Args, encode, rng: np.random.Generator, training: bool) -> gym.Env:
-    """Stack the transformations in the order of Figure 16 (training) or Figure 17 (evaluation: without the `if`)."""
+    try:
+        env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
+                       full_action_space=False, max_num_frames_per_episode=108_000)
+    except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
+        raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
-    env = NoOpReset(env, args.environment_no_op_max, rng)
-    env = MaxPool(env, args.environment_frames_to_maxpool)
-    env = ActionRepeat(env, args.agent_action_repeat)
-    env = Greyscale(env)
-    env = Downsample(env, args.environment_state_height, args.environment_state_width)
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0
+    env = NoOpReset(env, no_ops, no_op_rng)
+    env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
+    size = (args.environment_state_width, args.environment_state_height)
+    pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
+    env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
+    env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
+    env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
     if training:
-        env = RewardClip(env, args.environment_reward_clip_limit)
-        env = LifeLoss(env)
-    return FrameHistory(env, args.agent_history_length, encode)
-
-
-def wrapper(env: gym.Env, kind: type[gym.Wrapper]) -> gym.Wrapper:
-    """The wrapper of class `kind` in a stack."""
-    while not isinstance(env, kind):
-        env = env.env
+        limit = args.environment_reward_clip_limit
+        env = LifeLoss(ClipReward(env, -limit, limit))
     return env
 
 
-# ---- memory: lazy replay ---------------------------------------------------------------------------
-
-
-def frame_encoding(name: str, height: int, width: int, device: torch.device):
-    """Return (encode, decode). encode: (height, width) uint8 array -> an immutable object; decode: n such objects ->
-    (n, height, width) uint8 tensor on `device`."""
-    size = height * width
-    encode, decode = {
-        "lz4": (lambda frame: lz4.block.compress(frame, store_size=False),
-                lambda codes: torch.frombuffer(bytearray().join(
-                    [lz4.block.decompress(code, uncompressed_size=size) for code in codes]), dtype=torch.uint8)),
-        "raw": (lambda frame: frame, lambda codes: torch.from_numpy(np.stack(codes))),
-        "tensor": (lambda frame: torch.from_numpy(frame).to(device), torch.stack),
-    }[name]
-    return encode, lambda codes: decode(codes).view(-1, height, width).to(device)
-
-
-def to_bytes(code) -> bytes:
-    """An encoded frame as LZ4 bytes, for a checkpoint."""
-    if isinstance(code, bytes):
-        return code
-    frame = code.cpu().numpy() if torch.is_tensor(code) else code
-    return lz4.block.compress(frame, store_size=False)
-
-
-def from_bytes(blob: bytes, encoding_name: str, shape: tuple[int, int], encode) -> object:
-    """The encoded frame that `to_bytes` was given."""
-    if encoding_name == "lz4":
-        return blob
-    frame = bytearray(lz4.block.decompress(blob, uncompressed_size=shape[0] * shape[1]))
-    return encode(np.frombuffer(frame, np.uint8).reshape(shape))
+# ---- memory: lazy replay -------------------------------------------------------------------------
 
 
 class ReplayMemory:
-    """𝒟: the last `capacity` transitions (§5.3). A transition is references to its `agent_history_length + 1` encoded
-    frames, an action, a clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
-    Every transition is whole in itself: none can mix two episodes or span the place where the oldest is overwritten."""
+    """𝒟: the last `capacity` transitions (§5.3). One is references to its 5 frames, an action, a
+    clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
+    Each is whole in itself, so none can mix two episodes or cross the place of the oldest."""
 
-    def __init__(self, capacity: int, decode):
-        self.capacity, self.decode, self.added = capacity, decode, 0
-        self.frames = [()] * capacity  # per transition: x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}
-        self.actions = np.zeros(capacity, np.int64)
-        self.rewards = np.zeros(capacity, np.float32)
-        self.terminals = np.zeros(capacity, np.bool_)
+    def __init__(self, capacity: int, shape: tuple[int, int], device: str):
+        self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
+        self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
+        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
 
-    def add(self, state: tuple, action: int, reward: float, next_state: tuple, terminal: bool) -> None:
-        """Store (s, a, r, s'). Easy to get wrong: `terminal` must not be set by truncation, or a game that was cut off
-        teaches that its last state is worth nothing."""
+    def add(self, s: tuple, a: int, r: float, s_next: tuple, terminal: bool) -> None:
+        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`, or a game
+        that was cut off teaches that its last state is worth nothing."""
         i = self.added % self.capacity
-        self.frames[i] = (*state, next_state[-1])
-        self.actions[i], self.rewards[i], self.terminals[i] = action, reward, terminal
+        self.frames[i] = (*s, s_next[-1])
+        self.numbers[i] = a, r, terminal
         self.added += 1
 
-    def sample(self, size: int, rng: np.random.Generator) -> tuple[torch.Tensor, ...]:
-        """Draw ℬ uniformly with replacement: s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32, s' like s, terminal
-        (B,) bool, on the device."""
-        return self.gather(rng.integers(len(self), size=size))
-
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
-        """The transitions at `indices` (B,), as `sample` returns them."""
-        codes = [code for i in indices for code in self.frames[i]]
-        frames = self.decode(codes).unflatten(0, (len(indices), -1))  # (B, 5, 84, 84) uint8: s the first 4, s' the last
-        columns = [torch.from_numpy(column[indices]).to(frames.device)  # (B,) each
-                   for column in (self.actions, self.rewards, self.terminals)]
-        return frames[:, :-1], columns[0], columns[1], frames[:, 1:], columns[2]
+        """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
+        s' like s, terminal (B,) bool, on the device."""
+        frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
+        frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
+        # one (B, 3) array travels to the device; (B,) each
+        a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
+        return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
+
+    def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
+        """n LZ4 frames to (n, 84, 84) uint8 on the device."""
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
+
+    def state_dict(self) -> dict:
+        """For a checkpoint: every frame once, and per transition the places of its frames."""
+        stored = self.frames[: len(self)]
+        unique = {id(frame): frame for frames in stored for frame in frames}
+        place = dict(zip(unique, range(len(unique)), strict=True))
+        return {
+            "added": self.added,
+            "numbers": torch.from_numpy(self.numbers[: len(self)]),
+            "places": torch.tensor([[place[id(x)] for x in frames] for frames in stored]),
+            "lengths": torch.tensor([len(frame) for frame in unique.values()]),
+            "frames": torch.frombuffer(bytearray().join(unique.values()), dtype=torch.uint8),
+        }
+
+    def load_state_dict(self, saved: dict) -> None:
+        """Take over what `state_dict` gave."""
+        joined = saved["frames"].numpy().tobytes()
+        ends = saved["lengths"].cumsum(dim=0).tolist()
+        unique = [joined[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        self.added = saved["added"]
+        for i, places in enumerate(saved["places"].tolist()):
+            self.frames[i] = tuple(unique[place] for place in places)
+        self.numbers[: len(self)] = saved["numbers"].numpy()
 
 
-def most_recent(replay: ReplayMemory, size: int) -> np.ndarray:
-    """Indices of the last `size` transitions, oldest first (size,): the minibatch of an agent without replay buffer."""
-    return np.arange(replay.added - size, replay.added) % replay.capacity  # (size,)
-
-
-# ---- network ---------------------------------------------------------------------------------------
-
-
-class PixelConv2d(nn.Conv2d):
-    """A first layer for pixels from 0 to 255: it divides its filters by 255 instead of every pixel, which is the same
-    up to rounding, and less work."""
-
-    def filters(self) -> torch.Tensor:
-        return self.weight / 255
-
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return self._conv_forward(pixels, self.filters(), self.bias)
+# ---- network -------------------------------------------------------------------------------------
 
 
 class QNetwork(nn.Module):
-    """Table 2: (B, 4, 84, 84) uint8 states to (B, num_actions) float32 values Q(s, ·; θ)."""
+    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32."""
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
         for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
-        self.layers = nn.Sequential(OrderedDict(
-            conv1=PixelConv2d(history_length, 32, kernel_size=8, stride=4), conv1_relu=nn.ReLU(),  # (B, 32, 20, 20)
-            conv2=nn.Conv2d(32, 64, kernel_size=4, stride=2), conv2_relu=nn.ReLU(),                # (B, 64, 9, 9)
-            conv3=nn.Conv2d(64, 64, kernel_size=3, stride=1), conv3_relu=nn.ReLU(),                # (B, 64, 7, 7)
-            flatten=nn.Flatten(),                                                                  # (B, 3136)
-            linear=nn.Linear(64 * height * width, 512), linear_relu=nn.ReLU(),                     # (B, 512)
-        ))
-        self.head = nn.Linear(512, num_actions)                                                    # (B, num_actions)
+        self.layers = nn.Sequential(
+            nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
+            nn.Conv2d(32, 64, 4, stride=2), nn.ReLU(inplace=True),  # (B, 64, 9, 9)
+            nn.Conv2d(64, 64, 3, stride=1), nn.ReLU(inplace=True), nn.Flatten(),  # (B, 3136)
+            nn.Linear(64 * height * width, 512), nn.ReLU(inplace=True),  # (B, 512)
+        )
+        self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        x = self.layers(states.to(self.layers.conv1.weight.dtype))    # (B, 512)
-        return self.head(x.to(self.head.weight.dtype))                # (B, num_actions) float32
+        x = self.layers(states / 255)  # (B, 512)
+        with torch.autocast(x.device.type, enabled=False):  # Q keeps float32's digits
+            return self.head(x.float())  # (B, num_actions)
 
 
-def initialize_orthogonal(q_network: QNetwork) -> None:
-    """Orthogonal convolution filters, the best of Table 4 (§7.5.1); everything else stays PyTorch's default."""
-    for layer in q_network.layers:
-        if isinstance(layer, nn.Conv2d):
-            nn.init.orthogonal_(layer.weight)
+def initialize(q_network: QNetwork, name: str) -> None:
+    """Convolution filters of Table 4 (§7.5.1); everything else stays PyTorch's default."""
+    for i in (0, 2, 4):
+        if name == "orthogonal":
+            nn.init.orthogonal_(q_network.layers[i].weight)
+        elif name == "he":
+            nn.init.kaiming_normal_(q_network.layers[i].weight, nonlinearity="relu")
 
 
-def initialize_he(q_network: QNetwork) -> None:
-    """He-normal convolution filters, variance 2 / fan-in (Table 4, §7.5.1); everything else stays PyTorch's default."""
-    for layer in q_network.layers:
-        if isinstance(layer, nn.Conv2d):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-
-
-class LayersInOneDNN(nn.Sequential):
-    """The layers of a QNetwork, computed in the memory layout of oneDNN, PyTorch's library on CPUs. Layer by layer, it
-    would be converted to and from at every convolution. (A layer that does not know this layout needs `to_dense`.)"""
-
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        x = pixels.to_mkldnn()                                                        # (B, 4, 84, 84)
-        for layer in self:
-            if isinstance(layer, nn.Conv2d):
-                weight = layer.filters() if isinstance(layer, PixelConv2d) else layer.weight
-                x = torch.mkldnn_convolution(x, weight, layer.bias, layer.padding, layer.stride, layer.dilation,
-                                             layer.groups)                            # (B, filters, height, width)
-            else:
-                x = layer(x.to_dense() if isinstance(layer, nn.Flatten) else x)
-        return x                                                                      # (B, 512)
-
-
-def multiplies_bfloat16() -> bool:
-    """Whether the CPU has instructions for it."""
-    return any(torch.cpu.get_capabilities().get(unit) for unit in ("avx512_bf16", "amx_bf16"))
-
-
-def working_copy(q_network: QNetwork, precision: torch.dtype) -> QNetwork:
-    """The network that acts and learns while training: `q_network` itself, or its copy with layers of lower precision.
-    The head stays float32: Q keeps more than bfloat16's three digits."""
-    if precision == torch.float32:
-        return q_network
-    working_network = copy.deepcopy(q_network)
-    working_network.layers.to(precision)
-    if working_network.head.weight.is_cpu and multiplies_bfloat16():
-        working_network.layers = LayersInOneDNN(OrderedDict(working_network.layers.named_children()))
-    for θ in q_network.parameters():
-        θ.grad = torch.zeros_like(θ)  # `update` copies into it: allocated anew, its pages would cost time
-    return working_network
-
-
-# ---- algorithm: deep Q-learning --------------------------------------------------------------------
+# ---- algorithm: deep Q-learning ------------------------------------------------------------------
 
 
 class NatureRMSprop(torch.optim.Optimizer):
-    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the root. (PyTorch's own
-    adds it outside, and "gradient momentum 0.95" is the decay of the mean gradient, no momentum of the step.)"""
+    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the
+    root. PyTorch's adds it outside; "gradient momentum 0.95" is the decay of the mean gradient."""
 
-    def __init__(self, parameters, lr: float, mean_decay: float, square_decay: float, constant: float):
-        super().__init__(parameters, dict(lr=lr, mean_decay=mean_decay, square_decay=square_decay, constant=constant))
+    def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
+        super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
 
     @torch.no_grad()
     def step(self) -> None:
@@ -651,11 +405,10 @@ class NatureRMSprop(torch.optim.Optimizer):
                 state = self.state[θ]
                 if not state:
                     state["g"], state["n"] = torch.zeros_like(θ), torch.zeros_like(θ)
-                # g ← 0.95 g + 0.05 ∇        n ← 0.95 n + 0.05 ∇²        θ ← θ - lr ∇ / √(n - g² + 0.01)
-                state["g"].lerp_(θ.grad, 1 - group["mean_decay"])
-                state["n"].lerp_(θ.grad.square(), 1 - group["square_decay"])
-                variance = (state["n"] - state["g"].square()).clamp_min(0)  # below 0 only if the two decays differ
-                root = (variance + group["constant"]).sqrt()
+                # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
+                g = state["g"].lerp_(θ.grad, 1 - group["decay"])
+                n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
+                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 
@@ -663,1100 +416,399 @@ def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
     """Table 3's Adam, or Figure 18's RMSProp."""
     if args.optimizer_name == "Adam":
         return torch.optim.Adam(q_network.parameters(), lr=args.optimizer_learning_rate, fused=True)
-    return NatureRMSprop(q_network.parameters(), args.optimizer_learning_rate, args.optimizer_gradient_momentum,
-                         args.optimizer_squared_gradient_momentum, args.optimizer_min_squared_gradient)
+    return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
 
 
 def epsilon_at(frame: int, args: Args) -> float:
-    """ε at a frame: linear from ε_initial at frame 0 to ε_final at frame `agent_epsilon_greedy_annealing`, then
-    constant (Algorithm 6, lines 11-13)."""
-    annealed = min(frame / args.agent_epsilon_greedy_annealing, 1.0)
-    initial, final = args.agent_epsilon_greedy_epsilon_initial, args.agent_epsilon_greedy_epsilon_final
-    return initial + annealed * (final - initial)
+    """ε: linear from ε_initial at frame 0 to ε_final at frame `annealing`, then constant."""
+    initial = args.agent_epsilon_greedy_epsilon_initial
+    final = args.agent_epsilon_greedy_epsilon_final
+    return initial + min(frame / args.agent_epsilon_greedy_annealing, 1.0) * (final - initial)
 
 
 @torch.inference_mode()
-def greedy_action(q_network: QNetwork, state: torch.Tensor) -> int:
-    """π(s) = argmax_a Q(s, a; θ) (Equation 35) of one state (4, 84, 84) uint8."""
-    # waits for an accelerator; so do the points of the curves, and a frame or minibatch that is copied to it
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
+def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
+    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
+    is (4, 84, 84) uint8."""
+    if rng.random() < epsilon:
+        return int(rng.integers(q_network.head.out_features))
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
 
 
-def update(q_network: QNetwork, working_network: QNetwork, target_network: QNetwork, optimizer: torch.optim.Optimizer,
-           minibatch: tuple, discount: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """One optimization iteration (Algorithm 6, lines 20-22). The optimizer moves θ, the float32 weights of `q_network`;
-    the arithmetic is done by its `working_copy`, in lower precision or the same network. Returns the minibatch's mean
-    Huber loss, () float32, and Q(s_j, a_j; θ), (B,) float32."""
+def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
+    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
+    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
+    `minibatch` is what ReplayMemory.gather returns."""
     s, a, r, s_next, terminal = minibatch
+    with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        # y_j = r_j                                     if s_{j+1} is terminal
+        #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)       else                       (Equation 37)
+        with torch.no_grad():
+            y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
-    # y_j = r_j                                      if s_{j+1} is terminal
-    #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)        else                                   (Equation 37)
-    with torch.no_grad():
-        y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
+        # Q(s_j, a_j; θ)
+        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
-    # Q(s_j, a_j; θ)
-    q = working_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
-
-    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum, as in line 22; Adam's
-    # steps do not depend on the loss's scale, RMSProp's learning rate is meant for the sum.
-    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the mean of the minibatch.
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
+    # as in line 22: RMSProp's constant is meant for it, and Adam does not mind.
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
     assert q.shape == y.shape == r.shape
-    loss = F.huber_loss(q, y, reduction="sum")  # ()
-    working_network.zero_grad()
+    loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
+    optimizer.zero_grad()
     loss.backward()
-
-    # The gradient moves θ in float32, where a small step is not rounded away; then θ is cast anew. (Where the two are
-    # one network, both loops change nothing.)
-    pairs = list(zip(q_network.parameters(), working_network.parameters(), strict=True))
-    for θ, working in pairs:
-        θ.grad.copy_(working.grad)
     optimizer.step()
-    with torch.no_grad():
-        for θ, working in pairs:
-            working.copy_(θ)
     return loss.detach() / len(r), q.detach()
 
 
+def choose_precision(args: Args) -> str:
+    """Time 30 updates in float32 and in bfloat16: the quicker by a tenth, else float32."""
+    shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
+    q_network = QNetwork(*shape, num_actions=6).to(args.device, memory_format=torch.channels_last)
+    optimizer = make_optimizer(args, q_network)
+    s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
+    a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
+    learner = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
+
+    def seconds(precision: str) -> float:
+        runs = timeit.repeat(lambda: update(*learner, precision)[0].item(), number=1, repeat=30)
+        return min(runs)
+
+    best = {precision: seconds(precision) for precision in ("float32", "bfloat16")}
+    print(*(f"{precision}: {1000 * best[precision]:.1f} ms an update" for precision in best))
+    return "bfloat16" if best["bfloat16"] < 0.9 * best["float32"] else "float32"
+
+
 @torch.no_grad()
-def diagnose(q_network: QNetwork, states: torch.Tensor) -> dict[str, float]:
-    """How alive the network is on a minibatch of states (B, 4, 84, 84): of every layer the share of its units (filters)
-    that are 0 in every state, and the standard deviation of Q over the states, mean over actions. If a whole layer is
-    dead, Q is the same in all of them and no gradient passes to the layers below."""
-    scalars = {}
-    x = states.float()  # (B, 4, 84, 84)
-    for name, layer in q_network.layers.named_children():
-        x = layer(x)  # (B, units, …)
-        if isinstance(layer, nn.ReLU):
-            alive = (x > 0).transpose(0, 1).flatten(1).any(dim=1)  # (units,)
-            scalars[f"diagnostics/dead_units_{name.removesuffix('_relu')}"] = 1 - alive.float().mean().item()
-    scalars["diagnostics/q_spread"] = q_network.head(x).std(dim=0, correction=0).mean().item()
-    return scalars
+def dead_units(q_network: QNetwork, states: torch.Tensor) -> float:
+    """The share of the linear layer's 512 units that are 0 in all of the states (B, 4, 84, 84)."""
+    return (q_network.layers(states / 255) == 0).all(dim=0).float().mean().item()
 
 
-# ---- evaluation ------------------------------------------------------------------------------------
+# ---- evaluation ----------------------------------------------------------------------------------
 
 
-def evaluate(args: Args, q_network: QNetwork, encoding: tuple, number: int, stop: Stop, games: int | None = None,
-             frames: int | None = None) -> list[tuple[float, int]] | None:
-    """Play whole games at ε_evaluation for raw reward until `games` are finished or `frames` have passed; an unfinished
-    game does not count. It depends on the network, the seed and its own `number` alone. Returns (score, length in
-    frames) per game, or None if it was stopped. Number 0 is the final test."""
-    encode, decode = encoding
-    # + 1, for SeedSequence([seed, 0]) is SeedSequence(seed): the final test would draw what training drew
-    exploration, no_ops = (np.random.default_rng(s) for s in np.random.SeedSequence([args.seed, number + 1]).spawn(2))
-    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=False)
-    finished, score, length = [], 0.0, 0
-    state, _ = env.reset(seed=args.seed + number)
-    with tqdm(itertools.count() if frames is None else range(frames), desc="evaluation" if number else "final test",
-              unit="frame", leave=False, **bar_style()) as bar:
-        for _ in bar:
-            if exploration.random() < args.agent_epsilon_greedy_epsilon_evaluation:
-                action = int(exploration.integers(env.action_space.n))
-            else:
-                action = greedy_action(q_network, decode(state))
-            state, reward, terminated, truncated, _ = env.step(action)
-            score, length = score + reward, length + 1
-            if terminated or truncated:
-                finished.append((score, length))
-                bar.set_postfix_str(f"{len(finished)} games, last score {score:g}", refresh=False)
-                score, length = 0.0, 0
-                state, _ = env.reset()
-            if len(finished) == games or stop.signum:
-                break
-    env.close()
-    return None if stop.signum else finished
-
-
-def held_out_states(args: Args, encoding: tuple) -> torch.Tensor:
-    """`HELD_OUT_STATES` states (n, 4, 84, 84) uint8 that a random policy meets. Game and generators are their own, so
-    training is the same with and without them; they depend on the seed alone, so a resumed run has the same ones."""
-    encode, decode = encoding
-    fourth = np.random.SeedSequence(args.seed).spawn(4)[3]  # the first three are main's
-    policy, no_ops = (np.random.default_rng(seed) for seed in fourth.spawn(2))
-    env = preprocess(make_emulator(args.env_id), args, encode, no_ops, training=True)
+def held_out_states(args: Args, decode: Callable) -> torch.Tensor:
+    """500 states (500, 4, 84, 84) uint8, every fourth that a random policy meets. The seed alone
+    decides them, so a resumed run has the same ones."""
+    seeds = np.random.SeedSequence([args.seed, 0, 1]).spawn(2)
+    policy_rng, no_op_rng = [np.random.default_rng(seed) for seed in seeds]
+    env = FrameHistory(make_env(args, no_op_rng, training=True), args.agent_history_length)
     state, _ = env.reset(seed=args.seed)
     states = []
-    for frame in tqdm(range(HELD_OUT_STATES * HELD_OUT_INTERVAL), desc="held-out states", unit="frame", leave=False,
-                      **bar_style()):
-        state, _, terminated, truncated, _ = env.step(int(policy.integers(env.action_space.n)))
-        if frame % HELD_OUT_INTERVAL == 0:
-            states.append(decode(state))  # (4, 84, 84)
-        if terminated or truncated:
-            state, _ = env.reset()
+    while len(states) < 500:
+        for _ in range(4):
+            action = int(policy_rng.integers(env.action_space.n))
+            state, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                state, _ = env.reset()
+        states.append(decode(state))  # (4, 84, 84)
     env.close()
     return torch.stack(states)
 
 
-@torch.inference_mode()
-def mean_max_q(q_network: QNetwork, states: torch.Tensor) -> float:
-    """Mean over `states` (n, 4, 84, 84) of max_a Q(s, a; θ). Clipped rewards bound what it can honestly be: what grows
-    and grows has lost its footing."""
+@torch.no_grad()
+def max_q_mean(q_network: QNetwork, states: torch.Tensor) -> float:
+    """The mean of max_a Q(s, a; θ) over the states (B, 4, 84, 84)."""
     return q_network(states).amax(dim=1).mean().item()
 
 
-# ---- report and checkpoint -------------------------------------------------------------------------
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
+    """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
+
+    Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
+    and the random actions. Returns [(score, length in frames) of every finished game], and of the
+    unfinished one.
+    """
+    games = args.environment_evaluation_episodes if number else math.inf
+    seeds = np.random.SeedSequence([args.seed, number + 1]).spawn(2)  # [seed, 0] is training's
+    exploration_rng, no_op_rng = [np.random.default_rng(seed) for seed in seeds]
+    env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
+    state, _ = env.reset(seed=args.seed + number)
+    finished = []
+    epsilon = args.agent_epsilon_greedy_epsilon_evaluation
+    name = "evaluation" if number else "final test"
+    for _ in tqdm(range(args.environment_test_frames), name, leave=False, mininterval=1):
+        action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
+        state, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            finished.append((float(info["episode"]["r"]), info["episode"]["l"]))
+            state, _ = env.reset()
+        if len(finished) == games:
+            break
+    unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
+    env.close()
+    return finished, unfinished
+
+
+# ---- report and checkpoint -----------------------------------------------------------------------
 
 
 @dataclasses.dataclass
 class Counters:
-    """Everything that the loop counts; saved whole in a checkpoint."""
+    """Everything that the loop counts."""
 
     frames: int = 0
     updates: int = 0
     episodes: int = 0
-    evaluations: int = 0
-    evaluation_episodes: int = 0  # `episodes` at the last evaluation
-    checkpoint_episodes: int = 0  # `episodes` at the last checkpoint
-    game_score: float = 0.0  # raw, of the game now being played
-    game_length: int = 0  # frames
-    recent_scores: list[float] = dataclasses.field(default_factory=list)  # of the last 20 games
-    evaluation_rows: list[dict] = dataclasses.field(default_factory=list)  # of evaluations.csv
-    seconds: float = 0.0  # of wall-clock, evaluations included, pauses between resumes not
-    peak_memory: int = 0  # bytes resident, the most seen at a point of the curves or before a checkpoint
+    seconds: float = 0.0  # wall-clock, without the pauses between stop and resume
+    evaluations: list[dict] = dataclasses.field(default_factory=list)  # rows of evaluations.csv
+    speeds: list[float] = dataclasses.field(default_factory=list)  # frames/s, by REPORT_INTERVAL
 
 
-def evaluation_row(counters: Counters, finished: list[tuple[float, int]]) -> dict:
-    """A row of evaluations.csv; the mean and (population) variance of score and of length in frames are the columns of
-    Tables 4-6, None without a finished game."""
+def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
+    """A row of evaluations.csv: mean and (population) variance of the games' scores and lengths,
+    the columns of Tables 4 to 6; NaN without a finished game."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
-        values = [game[i] for game in finished]
-        row[f"{name}_mean"] = float(np.mean(values)) if values else None
-        row[f"{name}_variance"] = float(np.var(values)) if values else None
+        values = [game[i] for game in finished] or [math.nan]
+        row[f"{name}_mean"] = float(np.mean(values))
+        row[f"{name}_variance"] = float(np.var(values))
     return row | {"seconds": round(counters.seconds, 1)}
 
 
-class Stop:
-    """SIGINT or SIGTERM asks the loop to end at the next frame; a second SIGINT (Ctrl-C) ends the process at once. A
-    second SIGTERM does not: whoever stops a group of processes may send more than one."""
-
-    def __init__(self):
-        self.signum = 0
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, self)
-
-    def __call__(self, signum: int, _frame) -> None:
-        self.signum = signum
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-
-
-def bar_style() -> dict:
-    """tqdm's settings: a live bar in a terminal, an update a minute in a log."""
-    return dict(mininterval=0.5 if sys.stderr.isatty() else 60, dynamic_ncols=True, smoothing=0.05)
+def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple) -> None:
+    """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
+    and how fast the first and the last tenth of the learning frames were."""
+    evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
+    tenth = math.ceil(len(counters.speeds) / 10)
+    result = summary(counters, finished) | {
+        "last_evaluations_score_mean": float(np.mean(evaluations)),
+        "unfinished_score_and_length": unfinished,
+        "frames_per_second_first_tenth": float(np.median(counters.speeds[:tenth] or [math.nan])),
+        "frames_per_second_last_tenth": float(np.median(counters.speeds[-tenth:] or [math.nan])),
+        "scores": [score for score, _ in finished],
+        "lengths": [length for _, length in finished],
+    }
+    print("\n".join(f"{name:32}{value}" for name, value in result.items()))
+    write_text(path, json.dumps(result, indent=2))
 
 
-def attempt(what: str, write) -> bool:
-    """Call write(); if the disk refuses, say so in one line and go on: it is tried again at the next occasion."""
-    try:
-        write()
-        return True
-    except OSError as error:
-        reason = error.strerror or error
-        tqdm.write(f"warning: {what} could not be written ({reason}); the run goes on", file=sys.stderr)
-        return False
+def as_csv(rows: list[dict]) -> str:
+    """Rows under one header."""
+    lines = [rows[0].keys(), *(row.values() for row in rows)]
+    return "".join(",".join(map(str, line)) + "\n" for line in lines)
 
 
-class Curves:
-    """TensorBoard's event file. A full disk costs points of a curve, never the run."""
-
-    def __init__(self, run_dir: Path, first_frame: int):
-        # what a killed process logged after its last checkpoint is logged again: purge_step hides the first copy
-        self.run_dir, self.purge_step, self.writer = run_dir, first_frame or None, None
-        threading.excepthook = self.silence_full_disk
-
-    @staticmethod
-    def silence_full_disk(failure) -> None:
-        """TensorBoard writes in a thread of its own: what the disk refuses it `attempt` says, not a traceback."""
-        if not (issubclass(failure.exc_type, OSError) and type(failure.thread).__name__ == "_AsyncWriterThread"):
-            threading.__excepthook__(failure)
-
-    def write(self, add) -> None:
-        """Call add(writer); after a failure the next call begins a new event file."""
-
-        def open_and_add() -> None:
-            self.writer = self.writer or SummaryWriter(self.run_dir, purge_step=self.purge_step)
-            self.purge_step = None
-            add(self.writer)
-
-        if not attempt("a point of the curves", open_and_add):
-            self.writer = None
-
-    def add(self, scalars: dict[str, float], frame: int) -> None:
-        """Log scalars at a frame."""
-        self.write(lambda writer: [writer.add_scalar(name, value, frame) for name, value in scalars.items()])
-
-    def add_table(self, name: str, rows: dict, frame: int) -> None:
-        """Log a table of names and values."""
-        text = "\n".join(["name | value", "--- | ---", *(f"{key} | {value}" for key, value in rows.items())])
-        self.write(lambda writer: writer.add_text(name, text, frame))
-
-    def flush(self) -> None:
-        """Bring everything logged so far to the file."""
-        self.write(lambda writer: writer.flush())
-
-
-def write_atomically(path: Path, write) -> None:
-    """write(file) into a temporary file beside `path`, bring it to the disk, then rename: a crash or a full disk leaves
-    the old file or the new one, never a part. Raises OSError."""
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
+    """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
+    one, never a part. Exits with one line if the disk refuses."""
     temporary = path.with_name(path.name + ".tmp")
     try:
-        with open(temporary, "wb+") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
+        write(temporary)
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:  # torch.save makes a RuntimeError of an OSError
         temporary.unlink(missing_ok=True)
-    if os.name == "posix":  # so that the rename outlives a power cut; Windows has no handle of a directory
-        directory = os.open(path.parent, os.O_RDONLY)
-        os.fsync(directory)
-        os.close(directory)
+        raise SystemExit(f"error: {path} could not be written: {error}") from None
 
 
-def save_tensors(content: dict, file) -> None:
-    """torch.save, whose RuntimeError for a write that the disk refused is made the OSError that it hides."""
-    try:
-        torch.save(content, file)
-    except RuntimeError as error:
-        raise error.__context__ if isinstance(error.__context__, OSError) else OSError(str(error)) from None
-
-
-def write_json(path: Path, content: dict) -> None:
-    """Atomically write an indented JSON file."""
-    write_atomically(path, lambda file: file.write((json.dumps(content, indent=2) + "\n").encode()))
-
-
-def write_csv(path: Path, rows: list[dict]) -> None:
-    """Atomically write rows under one header."""
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, rows[0], lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+def write_text(path: Path, text: str) -> None:
+    """Write a text file."""
+    write_file(path, lambda temporary: temporary.write_text(text))
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember between two frames, beside the history and the generators."""
-    return {"emulator": env.unwrapped.ale.cloneState(include_rng=True).serialize(),
-            "lives": wrapper(env, LifeLoss).lives,
-            "screens": [torch.from_numpy(screen) for screen in wrapper(env, MaxPool).screens]}
+    """What the emulator and the wrappers remember from frame to frame."""
+    emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
+    names = ("history", "lives", "episode_returns", "episode_lengths")
+    return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
 
 
-def restore_environment(env: gym.Env, state: dict, history: tuple) -> None:
+def restore_environment(env: gym.Env, saved: dict) -> None:
     """Put `env` where `environment_state` was taken."""
-    env.reset()  # Gymnasium wants one before the first step; what it draws is overwritten with the generators
-    env.unwrapped.ale.restoreState(ale_py.ALEState(state["emulator"]))
-    wrapper(env, LifeLoss).lives = state["lives"]
-    wrapper(env, MaxPool).screens.clear()
-    wrapper(env, MaxPool).screens.extend(screen.numpy() for screen in state["screens"])
-    env.history = history
+    env.reset()
+    env.step(0)  # easy to get wrong: before its first action Q*bert's emulator takes no state whole
+    env.unwrapped.ale.restoreState(ale_py.ALEState(saved.pop("emulator")))
+    for name, value in saved.items():
+        env.set_wrapper_attr(name, value)
 
 
-def save_checkpoint(path: Path, state: dict, replay: ReplayMemory, history: tuple) -> None:
-    """One file that torch.load(weights_only=True) reads, with the encoded frames, each once, as one more member of
-    PyTorch's zip archive: they are streamed, so a million of them, LZ4 as they are, need no second copy in memory, and
-    the archive's CRC-32 guards every member. Raises OSError."""
-    blobs = []
-
-    def add(code) -> int:
-        blobs.append(to_bytes(code))
-        return len(blobs) - 1
-
-    def number(codes: tuple, before: tuple, row: list[int]) -> list[int]:
-        """The places of `codes` in `blobs`. Only neighbours share frames, so the transition before is all to look at:
-        after (a, b, c, d, e) at [0, 1, 2, 3, 4] comes (b, c, d, e, f) at [1, 2, 3, 4, 5], and only f is added; a new
-        episode (g, g, g, g, h) is at [6, 6, 6, 6, 7]."""
-        if row and all(map(operator.is_, codes, before[1:])):
-            return [*row[1:], *map(add, codes[len(before) - 1 :])]
-        places = {key: add(code) for key, code in {id(code): code for code in codes}.items()}
-        return [places[id(code)] for code in codes]
-
-    length, before, row = len(replay), (), []
-    indices = np.empty((length, len(history) + 1), np.int32)
-    for i, codes in enumerate(replay.frames[:length]):
-        indices[i] = row = number(codes, before, row)
-        before = codes
-    last = (replay.added - 1) % replay.capacity
-    now = number(history, replay.frames[last], indices[last].tolist()) if length else number(history, (), [])
-    columns = {"indices": indices, "actions": replay.actions[:length], "rewards": replay.rewards[:length],
-               "terminals": replay.terminals[:length], "lengths": np.fromiter(map(len, blobs), np.int32)}
-    state = state | {"format": CHECKPOINT_FORMAT, "history": now, "added": replay.added,
-                     "replay": {name: torch.from_numpy(column) for name, column in columns.items()}}
-
-    def write(file) -> None:
-        save_tensors(state, file)
-        with zipfile.ZipFile(file, "a") as archive, archive.open("archive/frames", "w", force_zip64=True) as member:
-            for start in range(0, len(blobs), 4096):
-                member.write(b"".join(blobs[start : start + 4096]))
-
-    write_atomically(path, write)
-
-
-def load_checkpoint(path: Path) -> tuple[dict, list[bytes]]:
-    """Return the state and the encoded frames that `save_checkpoint` wrote. Every member's checksum is compared first,
-    and nothing in the file is run (weights_only). Raises ValueError with one line for whatever is no whole
-    checkpoint."""
+def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generator]) -> Counters:
+    """Put everything where the checkpoint was taken; nothing in the file is run. Exits with one
+    line if it is not whole, or not of this run."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-            if damaged:
-                raise ValueError(f"the checksum of its member {damaged} is wrong")
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            if state["format"] != CHECKPOINT_FORMAT:
-                raise ValueError(f"its format is {state['format']!r}, this script reads {CHECKPOINT_FORMAT!r}")
-            with io.BufferedReader(archive.open("archive/frames"), 1 << 20) as member:
-                return state, [member.read(length) for length in state["replay"]["lengths"].tolist()]
-    except Exception as error:  # a damaged file can raise anything; none of it is a reason to go on
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"{path} cannot be resumed from: {reason}") from None
-
-
-def restore_run(saved: dict, codes, replay: ReplayMemory, env: gym.Env, generators: list, learnt: dict) -> tuple:
-    """Put everything where the checkpoint was taken; `codes` yields its frames, encoded for `replay`. Returns the
-    state. Raises ValueError, with the part's name, for a part that does not fit."""
-    part = "replay"
-    try:
-        codes = list(codes)
-        columns = {name: column.numpy() for name, column in saved["replay"].items()}
-        replay.added = saved["added"]
-        for i, row in enumerate(columns["indices"].tolist()):
-            replay.frames[i] = tuple(codes[number] for number in row)
-        for name in ("actions", "rewards", "terminals"):
-            getattr(replay, name)[: len(replay)] = columns[name]
-        state = tuple(codes[number] for number in saved["history"])
-        part = "environment"
-        restore_environment(env, saved["environment"], state)
-        for part, of_part in learnt.items():
-            of_part.load_state_dict(saved[part])
-        part = "generators"
-        for generator, generator_state in zip(generators, saved["generators"], strict=True):
-            generator.bit_generator.state = generator_state
-    except Exception as error:  # whatever it is, it is no reason to go on from half a state
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"its {part} does not fit ({reason})") from None
-    return state
+        if zipfile.ZipFile(path).testzip():
+            raise ValueError("a checksum is wrong")
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+        restore_environment(env, saved["environment"])
+        for rng, state in zip(rngs, saved["rngs"], strict=True):
+            rng.bit_generator.state = state
+        return Counters(**saved["counters"])
+    except Exception as error:  # a damaged file can raise anything
+        raise SystemExit(f"error: {path} cannot be resumed from: {error!r:.200}") from None
 
 
 def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
-    """The run directory, `args.resume` or a new one, and the lock on it, which the kernel releases when the process
-    dies. Raises ValueError if it cannot be written or another process writes it."""
-    name = f"{args.env_id.replace('/', '-')}__{script}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    run_dir = Path(args.resume) if args.resume else Path(args.runs_dir) / name
-    if args.resume and not (run_dir / "args.json").is_file():
-        raise ValueError(f"--resume {run_dir}: no run directory, it has no args.json")
+    """The run directory, `args.resume` or a new one, and the lock on it, which ends with the
+    process. Exits with one line if it cannot be written or another process writes it."""
+    name = f"{args.env_id}__{script}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
+    lock = filelock.FileLock(run_dir / ".lock", timeout=0)
     try:
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
-        lock = filelock.FileLock(run_dir / ".lock")
-        lock.acquire(timeout=0)
-    except filelock.Timeout:
-        raise ValueError(f"another process is writing {run_dir}") from None
-    except OSError as error:
-        raise ValueError(f"the run directory {run_dir} cannot be written: {error.strerror or error}") from None
+        lock.acquire()
+    except (OSError, filelock.Timeout) as error:
+        raise SystemExit(f"error: {run_dir} is in use or cannot be written: {error}") from None
     return run_dir, lock
 
 
-def resumed_args(args_class: type[Flags], run_dir: Path) -> Flags:
-    """The flags of the run in `run_dir`, with --environment-train-frames-max raised if the command line does. Raises
-    ValueError for any other flag that contradicts the run's own."""
-    try:
-        saved = args_class(**json.loads((run_dir / "args.json").read_text()))
-        given = dataclasses.replace(tyro.cli(args_class, default=saved), resume="")
-    except Exception as error:  # edited by hand it can hold anything
-        raise ValueError(f"{run_dir / 'args.json'} is no record of this script's flags: {error}") from None
-    for name, value in vars(given).items():
-        own = getattr(saved, name)
-        if value != own and not (name == "environment_train_frames_max" and value > own):
-            raise ValueError(f"{flag(name)} {value} contradicts the run's own {own}; "
-                             f"only --environment-train-frames-max may be raised")
-    return given
-
-
-def load_run(args: Args, run_dir: Path) -> tuple[dict, list[bytes]]:
-    """The state and the encoded frames of the run in `run_dir`. Raises ValueError if there are none, or another's."""
-    path = run_dir / "checkpoint.pt"
-    if not path.exists():
-        raise ValueError(f"--resume {run_dir}: it was stopped before its first checkpoint; start it anew")
-    state, blobs = load_checkpoint(path)
-    for name, value in vars(args).items():
-        other = state["args"].get(name)
-        if other != value and name != "environment_train_frames_max":
-            raise ValueError(f"{path} is another run's: its {flag(name)} is {other}, args.json says {value}")
-    return state, blobs
-
-
-def gigabytes(count: float) -> str:
-    """A number of bytes for people."""
-    return f"{count / 1e9:.2f} GB"
-
-
-def free_memory(device: torch.device) -> int:
-    """Bytes that are free on an NVIDIA GPU, or on the machine for whatever shares its memory; a container's or a
-    cluster's own limit is not known here."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
-
-
-def frame_bytes(args: Args) -> float:
-    """Mean size of an LZ4 frame, over 200 frames of random play, as a Python object."""
-    rng = np.random.default_rng(0)
-    encode, _ = frame_encoding("lz4", args.environment_state_height, args.environment_state_width, torch.device("cpu"))
-    env = preprocess(make_emulator(args.env_id), args, encode, rng, training=True)
-    env.reset(seed=args.seed)
-    sizes = []
-    for _ in range(200):
-        history, _, terminated, truncated, _ = env.step(int(rng.integers(env.action_space.n)))
-        sizes.append(sys.getsizeof(history[-1]))
-        if terminated or truncated:
-            env.reset()
-    env.close()
-    return float(np.mean(sizes))
-
-
-def choose_encoding(args: Args, device: torch.device) -> tuple[str, float]:
-    """The replay encoding, and the bytes that a full memory needs with it. Raises ValueError if they are not free."""
-    cpu = torch.device("cpu")
-    transitions = min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max)
-    pixels = args.environment_state_height * args.environment_state_width
-    # frame_bytes in any case: it refuses an env_id that cannot be played before a run directory is made
-    frame = {"lz4": frame_bytes(args), "raw": sys.getsizeof(np.empty(pixels, np.uint8)), "tensor": float(pixels)}
-    name = args.replay_encoding
-    if name == "auto":
-        fits = device.type != "cpu" and transitions * frame["tensor"] < 0.8 * free_memory(device)
-        name = "tensor" if fits else "lz4"
-    references = sys.getsizeof((None,) * (args.agent_history_length + 1)) + 16 + 8  # tuple, allocator, list
-    references += 8 + 4 + 1  # a, r, terminal
-    need, free = transitions * (frame[name] + references), free_memory(device if name == "tensor" else cpu)
-    if need > free:
-        raise ValueError(f"a replay memory of {transitions:,} transitions needs {gigabytes(need)}, {gigabytes(free)} "
-                         "are free; lower --agent-replay-buffer-maximum-length")
-    return name, need
-
-
-def choose_device(args: Args) -> tuple[torch.device, torch.dtype]:
-    """The device, and the type of the numbers in the networks that act and learn."""
-    name = args.device
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
-    by_itself = args.precision == "auto" and name == "cpu" and multiplies_bfloat16()
-    return torch.device(name), torch.bfloat16 if args.precision == "bfloat16" or by_itself else torch.float32
-
-
-class Arm(NamedTuple):
-    """What Tables 4, 5 and 6 vary: a game by ALE's name, the convolutions' weights, what is there."""
-
-    game: str
-    initialization: str = "orthogonal"
-    target_network: bool = True
-    replay_buffer: bool = True
-
-
-# mean and variance of an episode's score, mean and variance of its length in frames
-LECTURE = {
-    Arm("Breakout", "default"): (11.174, 696.84, 480.43, 22894),  # Table 4
-    Arm("Breakout", "he"): (22.865, 749.63, 703.13, 87811),
-    Arm("Breakout"): (32.154, 3695.1, 576.92, 29401),  # Tables 4, 5 and 6
-    Arm("Enduro"): (258.63, 14905, 4500.0, 2782600),  # Table 5
-    Arm("Pong"): (19.083, 5.4014, 1875.0, 56022),
-    Arm("Riverraid"): (3459.4, 877420, 833.33, 37002),
-    Arm("SpaceInvaders"): (748.14, 30417, 882.35, 41330),
-    Arm("Breakout", target_network=False): (10.549, 1.4201, 639.81, 27774),  # Table 6
-    Arm("Breakout", replay_buffer=False): (7.4837, 3.9444, 438.31, 35112),
-    Arm("Breakout", target_network=False, replay_buffer=False): (10.701, 1.2104, 671.64, 38953),
-}
-COLUMNS = {"score_mean": "Episode Score Mean", "score_variance": "Episode Score Variance",
-           "length_mean": "Episode Length Mean", "length_variance": "Episode Length Variance"}
-INITIALIZATIONS = {"default": "PyTorch Default", "he": "He", "orthogonal": "Orthogonal"}
-GAMES = {"Breakout": "Breakout", "Enduro": "Enduro", "Pong": "Pong", "Riverraid": "River Raid",
-         "SpaceInvaders": "Space Invaders"}
-# scores of random play and of a person, those of DQN Zoo: they put five games on one scale
-RANDOM_AND_HUMAN = {"Breakout": (1.7, 30.5), "Enduro": (0.0, 860.5), "Pong": (-20.7, 14.6),
-                    "Riverraid": (1338.5, 17118.0), "SpaceInvaders": (148.0, 1668.7)}
-# what each study varies, in the order of its table's rows
-STUDIES = {
-    "initialization": [{"initialization": name} for name in INITIALIZATIONS],
-    "games": [{"env_id": f"{game}NoFrameskip-v4"} for game in GAMES],
-    "ablation": [{"target_network": target, "replay_buffer": replay} for replay in (True, False)
-                 for target in (True, False)],
-}
-FULL = f"{Args.environment_train_frames_max:,} frames"  # the label of the lecture's own experiment
-# flags that the tables' rows tell apart, or that cannot change a score; runs that differ in any other are shown apart
-NOT_COMPARED = {
-    "initialization", "target_network", "replay_buffer", "env_id", "seed", "environment_train_frames_max",
-    "environment_evaluation_episodes", "environment_evaluation_interval_episodes",
-    "environment_checkpoint_interval_episodes", "device", "replay_encoding", "checkpoint_interval_minutes", "resume",
-    "runs_dir", "study", "seeds", "list", "table", "markdown", "figure"}
-
-
-def arm_folder(args: Args) -> str:
-    """The folder of an arm's runs: processes that start in the same second must not meet in one run directory."""
-    return "_".join([args.initialization, *(
-        f"no_{name}" for name in ("target_network", "replay_buffer") if not getattr(args, name))])
-
-
-def read_json_object(path: Path) -> dict:
-    """The object in a JSON file. Raises ValueError, in one line, if there is none."""
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} cannot be read: it holds no JSON object")
-    return content
-
-
-def started(folder: Path) -> str:
-    """The time in a run directory's name, which sorts as times do."""
-    return folder.name.rpartition("__")[2]
-
-
-def find_run(args: Args) -> str:
-    """The run directory in `args.runs_dir` with these very flags and a checkpoint, of several the one that trains for
-    the most frames, then the newest; "" if there is none."""
-    found = []
-    for folder in Path(args.runs_dir).glob("*"):
-        if (folder / "args.json").exists() and (folder / "checkpoint.pt").exists():
-            saved = read_json_object(folder / "args.json")
-            frames = saved.get("environment_train_frames_max", math.inf)  # may be raised
-            if (frames <= args.environment_train_frames_max
-                    and saved == vars(args) | {"resume": "", "environment_train_frames_max": frames}):
-                found.append((frames, started(folder), str(folder)))
-    return max(found)[-1] if found else ""
-
-
-def study_runs(args: Args) -> list[tuple[Args, list[str]]]:
-    """Flags and command line of every run of `args.study`: seed by seed, and for each seed all the arms."""
-    runs = []
-    for seed, changes in itertools.product(range(args.seed, args.seed + args.seeds), STUDIES[args.study]):
-        arm = dataclasses.replace(args, seed=seed, resume="auto", study="", seeds=1, list=False, **changes)
-        arm.runs_dir = str(Path(args.runs_dir) / arm_folder(arm))
-        command = [sys.executable, __file__]
-        for name, value in vars(arm).items():
-            if isinstance(value, bool) and value != getattr(Args, name):
-                command.append(flag(name if value else f"no_{name}"))
-            elif value != getattr(Args, name):
-                command += [flag(name), str(value)]
-        runs.append((arm, command))
-    return runs
-
-
-def run_study(args: Args) -> None:
-    """Run every command of the study, each in a process of its own, or print them for a cluster (--list). What has
-    finished is skipped, what was cut off goes on."""
-    runs = study_runs(args)
-    if args.list:
-        print("\n".join(shlex.join(command) for _, command in runs))
-        return
-    stop, failed = Stop(), 0
-    for number, (arm, command) in enumerate(runs, 1):
-        run_dir = find_run(arm)
-        test = Path(run_dir, "test.json")
-        finished = (run_dir and test.exists()
-                    and read_json_object(test).get("frames", 0) >= arm.environment_train_frames_max)
-        print(f"run {number} of {len(runs)}: {arm.env_id}, {arm_folder(arm)}, seed {arm.seed}"
-              + (f": finished, {run_dir}" if finished else ""), flush=True)
-        if finished:
-            continue
-        process = subprocess.Popen(command)
-        while process.poll() is None and not stop.signum:
-            time.sleep(0.1)
-        if stop.signum == signal.SIGTERM or (stop.signum and os.name == "posix"):
-            process.terminate()  # after a Ctrl-C that a terminal has sent to both, the run's `Stop` ignores it
-        failed += process.wait() != 0
-        if stop.signum:
-            print("stopped; the same command goes on")
-            raise SystemExit(128 + stop.signum)
-    if failed:
-        print(f"error: {failed} of {len(runs)} runs ended before their time; the same command tries again",
-              file=sys.stderr)
-        raise SystemExit(1)
-
-
-@dataclasses.dataclass
-class MeasuredRun:
-    """What --table reads of a run directory."""
-
-    folder: Path
-    arm: Arm
-    seed: int
-    label: str  # frames and the flags that make it another experiment
-    test: dict | None  # test.json; None while the run goes on
-    evaluations: list[dict[str, str]]  # evaluations.csv
-
-
-def game_of(env_id: str) -> str:
-    """ALE's name of a game: Breakout for BreakoutNoFrameskip-v4 and for ALE/Breakout-v5."""
-    return re.sub(r"^ALE/|(NoFrameskip)?-v\d+$", "", env_id)
-
-
-def read_run(folder: Path) -> MeasuredRun:
-    """Read a run directory. Raises ValueError with the file's name for a file that is broken."""
-    test = read_json_object(folder / "test.json") if (folder / "test.json").exists() else None
-    source = folder / ("test.json" if test and "args" in test else "args.json")
-    try:
-        args = Args(**(test["args"] if source.name == "test.json" else read_json_object(source)))
-        frames = args.environment_train_frames_max
-        if test:
-            source, frames = folder / "test.json", int(test["frames"])
-            for name in COLUMNS:
-                test[name] = None if test[name] is None else float(test[name])
-        others = [f"{flag(name)} {value}" for name, value in vars(args).items()
-                  if name not in NOT_COMPARED and value != getattr(Args, name)]
-        arm = Arm(game_of(args.env_id), args.initialization, args.target_network, args.replay_buffer)
-        source, evaluations = folder / "evaluations.csv", []
-        if source.exists():
-            evaluations = list(csv.DictReader(io.StringIO(source.read_text())))
-            for row in evaluations:
-                float(row["frames"]), float(row["score_mean"]), float(row.get("held_out_max_q_mean", 0))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{source} is broken: {type(error).__name__}: {error}") from None
-    return MeasuredRun(folder, arm, args.seed, ", ".join([f"{frames:,} frames", *others]), test, evaluations)
-
-
-def read_runs(folder: Path) -> list[MeasuredRun]:
-    """Every run below `folder`, oldest first. Raises ValueError if there is none, or if one is broken."""
-    if not folder.is_dir():
-        raise ValueError(f"--table {folder}: no such folder")
-    folders = {path.parent for name in ("test.json", "evaluations.csv") for path in folder.rglob(name)}
-    if not folders:
-        raise ValueError(f"--table {folder}: no test.json below it")
-    return [read_run(path) for path in sorted(folders, key=lambda path: (started(path), path))]
-
-
-def layouts(arms: set[Arm], complete: bool) -> list[tuple[str, tuple[str, ...], dict[Arm, tuple[str, ...]]]]:
-    """The tables that `arms` have something for, or the lecture's three if `complete`: title, names of the first
-    columns, and each row's first cells."""
-    games = GAMES | {game: game for game in sorted({arm.game for arm in arms} - GAMES.keys())}
-    shown = []
-    for game, name in games.items():
-        methods = {Arm(game, i): (title,) for i, title in INITIALIZATIONS.items()}
-        ablation = {Arm(game, **parts): tuple("Yes" if on else "No" for on in parts.values())
-                    for parts in STUDIES["ablation"]}
-        for title, first, rows in (("Table 4: Initialization Strategy Study", ("Initialization Method",), methods),
-                                   ("Table 6: Ablative Study", ("Target Network", "Replay Buffer"), ablation)):
-            if arms & (rows.keys() - {Arm(game)}) or (complete and rows.keys() <= LECTURE.keys()):
-                shown.append((f"{title} on {name}", first, rows))
-    rows = {Arm(game): (name,) for game, name in games.items()}
-    if complete or arms & rows.keys() - {arm for table in shown for arm in table[2]}:
-        shown.append(("Table 5: Game Performance Comparison", ("Game",), rows))
-    return sorted(shown, key=lambda table: table[0])
-
-
-def interquartile_mean(scores: np.ndarray) -> np.ndarray:
-    """Mean of the middle half along the last axis: a quarter, rounded down, is cut off at each end."""
-    cut = scores.shape[-1] // 4
-    return np.sort(scores, axis=-1)[..., cut : scores.shape[-1] - cut].mean(axis=-1)
-
-
-def iqm_interval(strata: list[list[float]], resamples: int = 50_000) -> str:
-    """Interquartile mean over all scores with its 95% stratified bootstrap interval (Agarwal et al., 2021): the runs of
-    each stratum, a game, are drawn anew with replacement, the strata themselves are not. Of one stratum with three or
-    four runs it is the range of their scores, which holds the true mean less often than that."""
-    rng = np.random.default_rng(0)
-    drawn = [rng.choice(scores, (resamples, len(scores))) for scores in strata]  # per stratum (resamples, seeds)
-    low, high = np.percentile(interquartile_mean(np.concatenate(drawn, axis=1)), (2.5, 97.5))
-    return f"{five_digits(interquartile_mean(np.concatenate(strata)))} [{five_digits(low)}, {five_digits(high)}]"
-
-
-def five_digits(value: float) -> str:
-    """Five digits, as in the lecture, and no power of ten."""
-    return f"{float(f'{value:.5g}'):,.15g}"
-
-
-def others_last(label: str) -> tuple[bool, str]:
-    """Sorts the lecture's own experiment before all others."""
-    return label != FULL, label
-
-
-def human_normalised(game: str, score: float) -> float:
-    """0 is random play, 1 is a person."""
-    random, human = RANDOM_AND_HUMAN[game]
-    return (score - random) / (human - random)
-
-
-def table_text(title: str, header: list[str], rows: list[list[str]], markdown: bool) -> str:
-    """A title and a table, as Markdown or with columns that line up."""
-    if markdown:
-        lines = ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
-        return "\n".join([f"### {title}", "", *lines])
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    return "\n".join([title, *("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
-                               for cells in [header, ["-" * width for width in widths], *rows])])
-
-
-def tables_text(runs: list[MeasuredRun], markdown: bool) -> str:
-    """Tables 4, 5 and 6: per arm the mean over its seeds, the lecture's figure in brackets. Runs with other frames or
-    hyperparameters stand apart, under their own heading."""
-    counted, left_out, blocks = {}, [], []  # counted: label -> arm -> seed -> run
-    for run in runs:
-        if run.test is None or run.test["score_mean"] is None:
-            left_out.append(f"{run.folder}: " + ("no test yet" if run.test is None else "no game of its test ended"))
-            continue
-        seeds = counted.setdefault(run.label, {}).setdefault(run.arm, {})
-        if run.seed in seeds:
-            left_out.append(f"{seeds[run.seed].folder}: the same run as {run.folder}, which is newer")
-        seeds[run.seed] = run
-
-    for label in sorted(counted, key=others_last):
-        arms, in_a_table = counted[label], set()
-        heading = (f"{label}, Table 3's hyperparameters: ours (the lecture's)" if label == FULL else
-                   f"Apart: {label}: ours (the lecture's, of {FULL} and Table 3's hyperparameters)")
-        blocks.append(f"## {heading}" if markdown else heading)
-        for title, first, rows in layouts(set(arms), complete=label == FULL):
-            cells = []
-            for arm, names in rows.items():
-                found, lecture = list(arms.get(arm, {}).values()), LECTURE.get(arm)
-                if not found and label != FULL:
-                    continue
-                row = [*names, str(len(found))]
-                for i, column in enumerate(COLUMNS):
-                    ours = five_digits(np.mean([run.test[column] for run in found])) if found else "-"
-                    row.append(ours + (f" ({five_digits(lecture[i])})" if lecture else ""))
-                row.append(iqm_interval([[run.test["score_mean"] for run in found]]) if len(found) >= 3 else "-")
-                cells.append(row)
-            in_a_table |= rows.keys()
-            header = [*first, "Seeds", *COLUMNS.values(), "IQM of Score [95%]"]
-            blocks.append(table_text(title, header, cells, markdown))
-            seeds = {len(arms.get(Arm(game), ())) for game in GAMES}  # as many each: every game counts the same
-            if first == ("Game",) and len(seeds) == 1 and min(seeds) >= 3:
-                ours = [[human_normalised(game, run.test["score_mean"]) for run in arms[Arm(game)].values()]
-                        for game in GAMES]
-                lecture = np.array([human_normalised(game, LECTURE[Arm(game)][0]) for game in GAMES])
-                blocks.append("Human-normalised score, five games, IQM [95%]: "
-                              f"{iqm_interval(ours)} ({five_digits(interquartile_mean(lecture))})")
-        left_out += [f"{run.folder}: an arm that no table has" for arm in arms.keys() - in_a_table
-                     for run in arms[arm].values()]
-    if left_out:
-        blocks.append("\n".join(["## Not counted" if markdown else "Not counted", *(f"- {line}" for line in left_out)]))
-    return "\n\n".join(blocks)
-
-
-def draw_curves(runs: list[MeasuredRun], path: Path) -> None:
-    """Learning curves: a row of two panels per table, label and game, with the score and the mean max Q of the held-out
-    states over frames; one colour per arm, one line per run; the lecture's figure is a dashed line. Raises ValueError
-    if there is nothing to draw, OSError if the file cannot be written."""
-    panels = []
-    drawn = [run for run in runs if run.evaluations]
-    for label in sorted({run.label for run in drawn}, key=others_last):
-        for title, _, rows in layouts({run.arm for run in drawn if run.label == label}, complete=False):
-            games = [{arm: names} for arm, names in rows.items()] if title.startswith("Table 5") else [rows]
-            for arms in games:
-                of_panel = [run for run in drawn if run.label == label and run.arm in arms]
-                if of_panel:
-                    name = f"{title.partition(':')[0]}, {of_panel[0].arm.game}: {label}"
-                    panels.append((textwrap.fill(name, 75, break_on_hyphens=False), arms, of_panel))
-    if not panels:
-        raise ValueError("--figure: no evaluations.csv with a row in it, or none of an arm of Tables 4, 5 and 6")
-    figure = Figure(figsize=(12, 4 * len(panels)), layout="constrained")
-    for (title, arms, of_panel), (scores, values) in zip(panels, figure.subplots(len(panels), 2, squeeze=False),
-                                                         strict=True):
-        for i, (arm, names) in enumerate(arms.items()):
-            mine = [run for run in of_panel if run.arm == arm]
-            name = names[0] if len(names) == 1 else f"target network: {names[0]}, replay buffer: {names[1]}"
-            for j, run in enumerate(mine):
-                style = dict(color=f"C{i}", linewidth=1, marker=".", label=name if j == 0 else None)
-                frames = [float(row["frames"]) for row in run.evaluations]
-                scores.plot(frames, [float(row["score_mean"]) for row in run.evaluations], **style)
-                if "held_out_max_q_mean" in run.evaluations[0]:  # dqn_atari.py has no such column
-                    values.plot(frames, [float(row["held_out_max_q_mean"]) for row in run.evaluations], **style)
-            if mine and arm in LECTURE:
-                scores.axhline(LECTURE[arm][0], color=f"C{i}", linestyle="--", linewidth=0.8)
-        for panel, name in ((scores, "score (dashed: the lecture's test)"), (values, "mean max Q, held-out states")):
-            panel.set(xlabel="frames", ylabel=name)
-            panel.set_title(title, fontsize="small")
-        if values.dataLim.y1 > 100:  # what diverges goes through decades, and would hide all else
-            values.set_yscale("symlog")
-        scores.legend(fontsize="small")
-    figure.savefig(path, dpi=120)
-
-
-def report_tables(args: Args) -> None:
-    """--table, and --figure with it."""
-    runs = read_runs(Path(args.table))
-    if args.figure:
-        try:
-            draw_curves(runs, Path(args.figure))
-        except OSError as error:
-            raise ValueError(f"--figure {args.figure} cannot be written: {error.strerror or error}") from None
-    print(tables_text(runs, args.markdown))
-
-
-# ---- main ------------------------------------------------------------------------------------------
+# ---- main ----------------------------------------------------------------------------------------
 
 
 def main(args: Args) -> None:
-    """Algorithm 6, between what it needs and what it leaves behind; or --study, or --table."""
-    wanted = 0
-    try:
-        if args.table or args.study or args.resume in ("", "auto"):  # a run's own flags are read first
-            check_ablation_args(args)
-        if args.table:
-            return report_tables(args)
-        if args.study:
-            return run_study(args)
-        if args.resume == "auto":
-            wanted, args = args.environment_train_frames_max, dataclasses.replace(args, resume=find_run(args))
-    except ValueError as error:
-        fail(str(error))
-    stop, resumed, saved = Stop(), args.resume, None
-    try:
-        if resumed:
-            run_dir, _lock = open_run(args, "")
-            args = resumed_args(Args, run_dir)
-            frames = max(args.environment_train_frames_max, wanted)  # a default does not stand on the command line
-            args = dataclasses.replace(args, environment_train_frames_max=frames)
-            check_ablation_args(args)
-        device, precision = choose_device(args)
-        encoding_name, replay_bytes = choose_encoding(args, device)
-        if resumed:
-            saved, blobs = load_run(args, run_dir)
-        else:
-            run_dir, _lock = open_run(args, Path(__file__).stem)
-    except ValueError as error:
-        fail(str(error))
-    counters = Counters(**saved["counters"]) if saved else Counters()
-    try:
-        tested = json.loads((run_dir / "test.json").read_text())["frames"]
-    except (OSError, ValueError, LookupError, TypeError):  # no test yet, or no whole one: it is done again
-        tested = None
-    if tested == counters.frames >= args.environment_train_frames_max:
-        print(f"{run_dir} has finished its {counters.frames:,} frames; --environment-train-frames-max trains on")
-        return
+    """Algorithm 6, between what it needs and what it leaves behind."""
+    # Adam's moments of dead units fade into denormal numbers, which make its step 10 times slower.
+    torch.set_flush_denormal(True)  # before the first parallel work: threads inherit it
+    torch.set_num_threads(args.threads or torch.get_num_threads())
+    args.threads = torch.get_num_threads()
+    if args.device == "auto":
+        args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    rngs = [np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(3)]
+    exploration_rng, minibatch_rng, no_op_rng = rngs
 
     # 1  Initialize the Atari 2600 simulator.
-    shape = args.environment_state_height, args.environment_state_width
-    encode, decode = encoding = frame_encoding(encoding_name, *shape, device)
-    seeds = np.random.SeedSequence(args.seed).spawn(3)
-    exploration_rng, minibatch_rng, no_op_rng = generators = [np.random.default_rng(seed) for seed in seeds]
-    env = preprocess(make_emulator(args.env_id), args, encode, no_op_rng, training=True)
-    actions = wrapper(env, JoystickActions).meanings
+    env = FrameHistory(make_env(args, no_op_rng, training=True), args.agent_history_length)
+    actions = env.get_wrapper_attr("meanings")
+    run_dir, _lock = open_run(args, Path(__file__).stem)
+    if args.precision == "auto":
+        args.precision = choose_precision(args)
     # 2  Initialize 𝒟.
-    replay = ReplayMemory(min(args.agent_replay_buffer_maximum_length, args.environment_train_frames_max), decode)
+    shape = (args.environment_state_height, args.environment_state_width)
+    replay = ReplayMemory(args.agent_replay_buffer_maximum_length, shape, args.device)
     # 3  Initialize θ.
     torch.manual_seed(args.seed)
     q_network = QNetwork(args.agent_history_length, *shape, len(actions))
-    if args.initialization == "orthogonal":
-        initialize_orthogonal(q_network)
-    elif args.initialization == "he":
-        initialize_he(q_network)
-    q_network.to(device)
+    initialize(q_network, args.initialization)
+    q_network.to(args.device, memory_format=torch.channels_last)
     optimizer = make_optimizer(args, q_network)
-    working_network = working_copy(q_network, precision)
     # 4  θ⁻ = θ
-    target_network = copy.deepcopy(working_network).requires_grad_(False)
+    target_network = q_network
+    if args.target_network:
+        target_network = copy.deepcopy(q_network).requires_grad_(False)
+    held_out = held_out_states(args, replay.decode)  # (500, 4, 84, 84)
+    # 5-7  ε is a function of the frame; the rest is counted.
+    counters = Counters()
+    s, _ = env.reset(seed=args.seed)
 
-    if saved:
-        learnt = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
-        codes = (from_bytes(blob, encoding_name, shape, encode) for blob in blobs)
-        try:
-            state = restore_run(saved, codes, replay, env, generators, learnt)
-        except ValueError as error:
-            fail(f"{run_dir / 'checkpoint.pt'} cannot be resumed from: {error}")
-        before = saved["target_network"]["layers.conv1.weight"].dtype
-        if before != precision:
-            print(f"note     trained in {before} so far, from here in {precision}: see --precision", flush=True)
-        working_network.load_state_dict(q_network.state_dict())
-        del saved, blobs
-    else:
-        state, _ = env.reset(seed=args.seed)
-    try:
-        write_json(run_dir / "args.json", vars(args))
-    except OSError as error:
-        fail(f"the run directory {run_dir} cannot be written: {error.strerror or error}")
+    parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer,
+             "replay": replay}
+    if args.resume:
+        counters = restore(run_dir / "checkpoint.pt", parts, env, rngs)
+        s = env.get_wrapper_attr("history")
+    write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
+    writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
+    print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
 
-    states = held_out_states(args, encoding)  # (500, 4, 84, 84) uint8
-    target_interval = (args.optimizer_q_network_parameter_update_interval_frames if args.target_network
-                       else args.agent_update_frequency)  # without a target network: θ⁻ = θ after every update
+    def save_q_network() -> None:
+        """What it takes to play."""
+        content = {"args": vars(args), "actions": actions, "frames": counters.frames,
+                   "q_network": q_network.state_dict()}
+        write_file(run_dir / "q_network.pt", lambda path: torch.save(content, path))
 
-    print(f"arm      {arm_folder(args)}\n"
-          f"game     {args.env_id}: {len(actions)} actions, {' '.join(actions)}\n"
-          f"device   {device}, {torch.get_num_threads()} threads; training in {str(precision).removeprefix('torch.')}\n"
-          f"network  {sum(parameter.numel() for parameter in q_network.parameters()):,} parameters\n"
-          f"replay   {replay.capacity:,} transitions as {encoding_name}: about {gigabytes(replay_bytes)} when full, "
-          f"{gigabytes(free_memory(device if encoding_name == 'tensor' else torch.device('cpu')))} free; "
-          f"learning starts with {args.agent_replay_buffer_initial:,}\n"
-          f"run      {run_dir}" + (f", resumed at frame {counters.frames:,}" if resumed else ""), flush=True)
+    def save_checkpoint() -> None:
+        """Everything: on a CPU a resumed run is bit for bit the run that never stopped."""
+        writer.flush()
+        content = {name: part.state_dict() for name, part in parts.items()}
+        content["environment"] = environment_state(env)
+        content["rngs"] = [rng.bit_generator.state for rng in rngs]
+        content["counters"] = vars(counters)
+        write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    if args.agent_replay_buffer_initial > args.environment_train_frames_max:
-        print(f"note     learning starts at frame {args.agent_replay_buffer_initial:,}, this run ends at "
-              f"{args.environment_train_frames_max:,}: it learns nothing; lower --agent-replay-buffer-initial",
-              flush=True)
+    stop = []  # signals: the loop ends with the frame, or the evaluation, that it is at
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
+    loss = q = torch.zeros(())
+    started = time.monotonic() - counters.seconds
+    checkpoint_time = window_time = time.monotonic()
+    window_frames = counters.frames
 
-    curves = Curves(run_dir, counters.frames + 1 if resumed else 0)
-    curves.add_table("hyperparameters", {flag(name): value for name, value in vars(args).items()}, counters.frames)
-    process, dead, loss = psutil.Process(), set(), None
-    # a multiple of the update frequency, so that every point has a fresh loss
-    log_interval = math.ceil(LOG_INTERVAL / args.agent_update_frequency) * args.agent_update_frequency
-    clock = checkpoint_time = time.monotonic()
-
-    def stop_if_not_finite() -> None:
-        """A NaN never leaves the weights again: end the run before one reaches a checkpoint."""
-        if loss is not None and not all(tensor.isfinite().all() for tensor in (loss, *q_network.parameters())):
-            bar.close()
-            last = run_dir / "checkpoint.pt"
-            print(f"error: the loss or a weight is not finite at frame {counters.frames:,}; the last checkpoint is "
-                  f"{last if last.exists() else 'not yet written'}; lower --optimizer-learning-rate", file=sys.stderr)
-            raise SystemExit(1)
-
-    def count_seconds() -> None:
-        nonlocal clock
-        counters.seconds, clock = counters.seconds + time.monotonic() - clock, time.monotonic()
-
-    def keep_evaluations() -> bool:
-        return attempt("evaluations.csv", lambda: write_csv(run_dir / "evaluations.csv", counters.evaluation_rows))
-
-    def now() -> tuple[float, int, int]:
-        """Where a `window` begins, the frames whose rates are shown: no evaluation or checkpoint lies within one."""
-        return time.monotonic(), counters.frames, counters.updates
-
-    def checkpoint() -> bool:
-        """Write q_network.pt, all that is needed to play, and checkpoint.pt, all that is needed to go on."""
-        stop_if_not_finite()
-        count_seconds()
-        counters.peak_memory = max(counters.peak_memory, process.memory_info().rss)
-        curves.flush()
-        common = {"args": vars(args), "q_network": q_network.state_dict()}
-        weights = common | {"format": Q_NETWORK_FORMAT, "actions": actions, "frames": counters.frames}
-        everything = common | {
-            "target_network": target_network.state_dict(), "optimizer": optimizer.state_dict(),
-            "counters": dataclasses.asdict(counters), "environment": environment_state(env),
-            "generators": [generator.bit_generator.state for generator in generators]}
-        evaluated = not counters.evaluation_rows or keep_evaluations()  # again, for the disk may have been full
-        playable = attempt("q_network.pt", lambda: write_atomically(
-            run_dir / "q_network.pt", lambda file: save_tensors(weights, file)))
-        resumable = attempt("checkpoint.pt", lambda: save_checkpoint(
-            run_dir / "checkpoint.pt", everything, replay, state))
-        return evaluated and playable and resumable
-
-    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, unit="frame", unit_scale=True,
-               bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]", **bar_style())
-
-    window = now()
-
-    # 5-7 are `counters`; ε is a function of the frame. Evaluation stands first, so that one that was cut off is done
-    # again when the run is resumed.
-    # 8  while total_frames < number of frames to train
-    while counters.frames < args.environment_train_frames_max:
-        # 27-29  Evaluate the agent.
-        if counters.episodes - counters.evaluation_episodes >= args.environment_evaluation_interval_episodes:
-            finished = evaluate(args, q_network, encoding, counters.evaluations + 1, stop,
-                                games=args.environment_evaluation_episodes)
-            if finished is not None:
-                counters.evaluations += 1
-                counters.evaluation_episodes = counters.episodes
-                count_seconds()
-                row = evaluation_row(counters, finished) | {"held_out_max_q_mean": mean_max_q(q_network, states)}
-                counters.evaluation_rows.append(row)
-                keep_evaluations()
-                columns = ("score_mean", "score_variance", "length_mean", "held_out_max_q_mean")
-                curves.add({f"evaluation/{name}": row[name] for name in columns}, counters.frames)
-                tqdm.write(f"evaluation {counters.evaluations} at frame {counters.frames:,}, "
-                           f"update {counters.updates:,}, episode {counters.episodes:,}: "
-                           f"score {row['score_mean']:.2f} (variance {row['score_variance']:.4g}), "
-                           f"length {row['length_mean']:.1f} frames, "
-                           f"mean max Q of the held-out states {row['held_out_max_q_mean']:.4g}")
-            window = now()
-        if stop.signum:
-            break
-        if (counters.episodes - counters.checkpoint_episodes >= args.environment_checkpoint_interval_episodes
-                or time.monotonic() - checkpoint_time >= 60 * args.checkpoint_interval_minutes):
-            counters.checkpoint_episodes = counters.episodes
-            checkpoint()
-            checkpoint_time = time.monotonic()
-            window = now()
-
-        # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q_θ(s, a); reduce ε; add (s, a, r, s') to 𝒟.
-        epsilon = epsilon_at(counters.frames, args)
-        if exploration_rng.random() < epsilon:
-            action = int(exploration_rng.integers(len(actions)))
-        else:
-            action = greedy_action(working_network, decode(state))
-        next_state, reward, terminated, truncated, info = env.step(action)
-        replay.add(state, action, reward, next_state, terminated)
-        state = next_state
-
-        # 30  total_frames = total_frames + 1
+    # 8, 30  while total_frames < number of frames to train
+    while counters.frames < args.environment_train_frames_max and not stop:
         counters.frames += 1
-        counters.game_length += 1
-        counters.game_score += info["raw_reward"]
+
+        # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q(s, a; θ). Add (s, a, r, s') to 𝒟.
+        epsilon = epsilon_at(counters.frames - 1, args)
+        a = epsilon_greedy(q_network, replay.decode(s), epsilon, exploration_rng)
+        s_next, r, terminated, truncated, info = env.step(a)
+        replay.add(s, a, r, s_next, terminated)
+        s = s_next
 
         # 14-17  If the episode has ended, reset.
-        if terminated or truncated:
+        episode_ended = terminated or truncated
+        if episode_ended:
             counters.episodes += 1
-            state, _ = env.reset()
-            if info["game_over"]:
-                curves.add({"charts/episodic_return": counters.game_score,
-                            "charts/episodic_length": counters.game_length}, counters.frames)
-                counters.recent_scores = [*counters.recent_scores, counters.game_score][-20:]
-                counters.game_score, counters.game_length = 0.0, 0
+            s, _ = env.reset()
+        if "episode" in info:  # the game has ended, too
+            writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
+            writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
+            bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)
 
-        # 18-23  If |𝒟| ≥ initial, sample ℬ ⊆ 𝒟, compute y and perform one iteration of gradient descent.
-        if len(replay) >= args.agent_replay_buffer_initial and counters.frames % args.agent_update_frequency == 0:
+        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, one iteration of gradient descent.
+        learning = len(replay) >= args.agent_replay_buffer_initial
+        if learning and counters.frames % args.agent_update_frequency == 0:
+            size = args.optimizer_minibatch_size
+            indices = np.arange(replay.added - size, replay.added) % replay.capacity  # the last
             if args.replay_buffer:
-                minibatch = replay.sample(args.optimizer_minibatch_size, minibatch_rng)
-            else:
-                minibatch = replay.gather(most_recent(replay, args.optimizer_minibatch_size))
-            loss, q = update(q_network, working_network, target_network, optimizer, minibatch,
-                             args.agent_discount_factor)
+                indices = minibatch_rng.integers(len(replay), size=size)
+            minibatch = replay.gather(indices)
+            loss, q = update(q_network, target_network, optimizer, minibatch,
+                             args.agent_discount_factor, args.precision)
             counters.updates += 1
 
-        # 24-26  θ⁻ = θ, in the precision of the working network
-        if counters.frames % target_interval == 0:
+        # 24-26  θ⁻ = θ
+        if counters.frames % args.optimizer_q_network_parameter_update_interval_frames == 0:
             target_network.load_state_dict(q_network.state_dict())
 
+        # 27-29  Evaluate the agent.
+        if episode_ended and counters.episodes % args.environment_evaluation_interval_episodes == 0:
+            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            row = summary(counters, finished)
+            row["held_out_max_q_mean"] = max_q_mean(q_network, held_out)
+            counters.evaluations.append(row)
+            write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))
+            mean = counters.evaluations[-1]["score_mean"]
+            writer.add_scalar("evaluation/score_mean", mean, counters.frames)
+            held_out_max_q = row["held_out_max_q_mean"]
+            writer.add_scalar("evaluation/held_out_max_q_mean", held_out_max_q, counters.frames)
+            tqdm.write(f"frame {counters.frames:,}, update {counters.updates:,}: score {mean}")
+        if episode_ended and counters.episodes % args.environment_checkpoint_interval_episodes == 0:
+            save_q_network()
+
         bar.update()
-        if counters.frames % log_interval == 0:
-            stop_if_not_finite()
-            seconds, frames, updates = map(operator.sub, now(), window)
-            window = now()
-            scalars = {"charts/epsilon": epsilon, "charts/frames_per_second": frames / seconds}
-            if loss is not None:
-                scalars |= {"losses/huber": loss.item(), "losses/q_values": q.mean().item()}
-                scalars |= diagnose(q_network, minibatch[0])
-            curves.add(scalars, counters.frames)
-            now_dead = {name for name, share in scalars.items() if "dead_units" in name and share == 1}
-            for name in sorted(now_dead - dead):
-                tqdm.write(f"warning: frame {counters.frames:,}: {name} is 1: Q is the same in every state, the "
-                           "layers below learn no more; start again with a lower --optimizer-learning-rate",
-                           file=sys.stderr)
-            dead = now_dead
-            counters.peak_memory = max(counters.peak_memory, process.memory_info().rss)
-            score = f"{np.mean(counters.recent_scores):.1f}" if counters.recent_scores else "none yet"
-            bar.set_postfix_str(f"{frames / seconds:.0f} frames/s, {updates / seconds:.0f} updates/s, "
-                                f"ε {epsilon:.3f}, score {score}", refresh=False)
+        counters.seconds = time.monotonic() - started
+        if counters.frames % REPORT_INTERVAL == 0:
+            if not loss.isfinite():  # it never leaves the weights again
+                raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
+            speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
+            some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
+            scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
+                       "losses/td_loss": loss.item(), "losses/q_values": q.mean().item(),
+                       "diagnostics/dead_units": dead_units(q_network, replay.gather(some)[0])}
+            for name, value in scalars.items():
+                writer.add_scalar(name, value, counters.frames)
+            if learning:
+                counters.speeds.append(speed)
+            if time.monotonic() - checkpoint_time > 60 * args.checkpoint_interval_minutes:
+                save_checkpoint()
+                checkpoint_time = time.monotonic()
+            window_time, window_frames = time.monotonic(), counters.frames
 
     # 32  return θ
     bar.close()
-    saved_at_the_end = checkpoint()
-    if not stop.signum:
-        finished = evaluate(args, q_network, encoding, 0, stop, frames=args.environment_test_frames)
-    curves.flush()
-    if stop.signum and not saved_at_the_end:
-        print(f"error: stopped at frame {counters.frames:,}, which {run_dir} could not keep", file=sys.stderr)
-        raise SystemExit(1)
-    if stop.signum:
-        command = [sys.executable, sys.argv[0], "--resume", str(run_dir)]
-        shell_line = shlex.join(command) if os.name == "posix" else subprocess.list2cmdline(command)
-        print(f"stopped at frame {counters.frames:,}; go on with: {shell_line}")
-        raise SystemExit(128 + stop.signum)
-
-    count_seconds()
-    result = evaluation_row(counters, finished) | {"held_out_max_q_mean": mean_max_q(q_network, states)}
-    modules = (torch, np, gym, ale_py, cv2)
-    saved_at_the_end = saved_at_the_end and attempt("test.json", lambda: write_json(run_dir / "test.json", result | {
-        "scores": [score for score, _ in finished], "lengths": [length for _, length in finished],
-        "seed": args.seed, "env_id": args.env_id, "device": f"{device}, {platform.machine()}, {os.cpu_count()} cores",
-        "precision": str(precision).removeprefix("torch."), "threads": torch.get_num_threads(),
-        "versions": {"python": platform.python_version()} | {module.__name__: module.__version__ for module in modules},
-        "peak_memory_bytes": counters.peak_memory, "args": vars(args)}))
-    if not finished:
-        print(f"no game ended within --environment-test-frames {args.environment_test_frames:,}")
-    else:
-        print(f"{'Game':<28}{'Episode Score Mean':>20}{'Variance':>12}{'Episode Length Mean':>21}{'Variance':>12}"
-          f"{'Games':>7}\n{args.env_id:<28}{result['score_mean']:>20.5g}{result['score_variance']:>12.5g}"
-          f"{result['length_mean']:>21.5g}{result['length_variance']:>12.5g}{len(finished):>7}")
-    if not saved_at_the_end:
-        raise SystemExit(1)
+    if loss.isfinite():
+        save_checkpoint()
+    save_q_network()
+    if stop:
+        print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
+        raise SystemExit(128 + stop[0])
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
+    finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
+    write_test(run_dir / "test.json", counters, finished, unfinished)
 
 
 if __name__ == "__main__":
-    main(parse_args(Args))
+    sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
+    main(read_args())
