@@ -1,12 +1,13 @@
-"""Resident memory of dqn_atari.py's replay memory, filled by random play of the five games of Table 5.
+"""Resident memory of dqn_atari.py's replay memory, filled by random play of the five games of Table
+5.
 
-    python benchmarks/replay_memory.py                             # 100,000 transitions a game, scaled to a million
+    python benchmarks/replay_memory.py        # 100,000 transitions a game, scaled to a million
     python benchmarks/replay_memory.py --transitions 1000000 --games SpaceInvaders
 
-One process a game. Resident memory is what the operating system counts for the process (RSS), after less before:
-frames, references, actions, rewards and whatever Python and the allocator add. Beside it stand the lecture's figure
-(§7.3.2), one raw 84×84 frame a transition, and what CleanRL (one stack of four frames) and Stable-Baselines3 (two
-stacks) allocate.
+One process a game. Resident memory is what the operating system counts for the process (RSS),
+after less before: frames, references, actions, rewards and whatever Python and the allocator add.
+Beside it stand the lecture's figure (§7.3.2), one raw 84×84 frame a transition, and what CleanRL
+(one stack of four frames) and Stable-Baselines3 (two stacks) allocate.
 """
 
 import dataclasses
@@ -18,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-import torch
 import tyro
 from tqdm import tqdm
 
@@ -36,20 +36,19 @@ class Args:
     """Used by the benchmark itself: measure one game in this process."""
 
 
-def play(game: str, capacity: int, transitions: int):
-    """`transitions` of random play in a replay memory of `capacity`; returns (environment, memory, state)."""
+def play(game: str, capacity: int, transitions: int) -> dqn.ReplayMemory:
+    """`transitions` of random play in a replay memory of `capacity`."""
     args = dqn.Args(env_id=f"{game}NoFrameskip-v4")
     rng = np.random.default_rng(0)
-    encode, decode = dqn.frame_encoding("lz4", 84, 84, torch.device("cpu"))
-    env = dqn.preprocess(dqn.make_emulator(args.env_id), args, encode, rng, training=True)
-    memory = dqn.ReplayMemory(capacity, decode)
-    state, _ = env.reset(seed=1)
+    env = dqn.FrameHistory(dqn.make_env(args, rng, training=True), args.agent_history_length)
+    replay = dqn.ReplayMemory(capacity, (84, 84), "cpu")
+    s, _ = env.reset(seed=1)
     for _ in tqdm(range(transitions), desc=game, unit="frame", unit_scale=True):
-        action = int(rng.integers(env.action_space.n))
-        next_state, reward, terminated, truncated, _ = env.step(action)
-        memory.add(state, action, reward, next_state, terminated)
-        state = env.reset()[0] if terminated or truncated else next_state
-    return env, memory, state
+        a = int(rng.integers(env.action_space.n))
+        s_next, r, terminated, truncated, _ = env.step(a)
+        replay.add(s, a, r, s_next, terminated)
+        s = env.reset()[0] if terminated or truncated else s_next
+    return replay
 
 
 def resident(game: str, transitions: int) -> int:
@@ -72,12 +71,18 @@ def main(args: Args) -> None:
     print(f"{args.transitions:,} transitions a game\n")
     print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
     for game in args.games:
-        done = subprocess.run([sys.executable, __file__, "--worker", "--games", game, "--transitions",
-                               str(args.transitions)], stdout=subprocess.PIPE, check=True, text=True)
+        command = [sys.executable, __file__, "--worker", "--games", game]
+        command += ["--transitions", str(args.transitions)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
         each = json.loads(done.stdout.splitlines()[-1]) / args.transitions
         print(f"{'dqn_atari.py, ' + game:<44}{each / 1e3:>10.2f}{each:>12.0f}", flush=True)
-    for name, each in (("one raw frame (Nature, Dopamine)", 84 * 84), ("the lecture (§7.3.2)", 11_000),
-                       ("CleanRL: a stack of 4", 4 * 84 * 84), ("Stable-Baselines3: two stacks of 4", 8 * 84 * 84)):
+    others = {
+        "one raw frame (Nature, Dopamine)": 84 * 84,
+        "the lecture (§7.3.2)": 11_000,
+        "CleanRL: a stack of 4": 4 * 84 * 84,
+        "Stable-Baselines3: two stacks of 4": 8 * 84 * 84,
+    }
+    for name, each in others.items():
         print(f"{name:<44}{each / 1e3:>10.2f}{each:>12,}")
 
 
