@@ -1,728 +1,258 @@
 # /// script
 # requires-python = ">=3.10"
-# dependencies = ["numpy>=2.0", "scipy>=1.14", "gymnasium>=1.0", "tyro>=0.9", "tqdm>=4.66", "matplotlib>=3.9"]
+# dependencies = [
+#     "gymnasium>=1.0", "numpy>=2.0", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+# ]
 # ///
-"""Exhaustive search: the best of all policies of a known Markov decision process (§4.2 and Algorithm 2).
+"""Exhaustive search: the best policy, by evaluating every one (§4.2, Algorithm 2).
 
 Run it
-    python algorithms/exhaustive_search.py                                    # the lecture's MDP
-    python algorithms/exhaustive_search.py --mdp my_mdp.json --discount 0.9 --output-json best.json
+    python algorithms/exhaustive_search.py                    # the lecture's MDP has three policies
+    python algorithms/exhaustive_search.py --model my_mdp.json --discount 0.95
 
 Measured
-    The first command goes through 3 policy graphs, of 4 assignments of actions; V(s0) = 11, 9 and 10.09, so that π¹
-    is the best. The warm start saves 1 of 36 sweeps. `--env-id FrozenLake-v1` is refused: 4,294,967,296
-    assignments.
+    The first command evaluates 3 policies and finds π1 with V(s0) = 11.
 
 Deviations
-    lecture                      this file                               why
-    ---------------------------  --------------------------------------  ----------------------------------------------
-    enumerate all policies       distinct policy graphs                  what is not reached needs no action; there are
-                                                                         3 in the lecture's example, too
-    initialise V_0 from common   V(s) under the latest policy that       neighbours in the enumeration share most of
-    subgraphs (§4.2)             reached s, 0 if none did                their graph
-    line 6: <                    < by more than 1e-9; ties are reported  floats
-    no discount                  `--discount` γ, 1 if not given          to serve other MDPs
-    nothing of endless policies  passed over if their value is not       the limit of Algorithm 1 from V_0 = 0
-                                 finite; an error if V* is infinite
+    A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2.
+    Every evaluation starts from the values of the policies before it, as §4.2 suggests; the sweeps
+    that this saves are counted against starts from V = 0.
+    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
+    has no value (it may never end, at discount 1) is an error.
 """
 
-import collections
-import contextlib
-import dataclasses
-import functools
-import inspect
-import io
 import itertools
 import json
-import math
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy import sparse
-from scipy.sparse import csgraph
 from tqdm import tqdm
-
-Flags = TypeVar("Flags")
 
 # ---- Args ----------------------------------------------------------------------------------------
 
 
 @dataclass
 class Args:
-    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in sweeps over all states."""
+    """V and rewards have one unit; an iteration is a sweep over a policy's states."""
 
-    mdp: Path | None = None
-    """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
+    model: Path | None = None
+    """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """a Gymnasium environment with a model, such as FrozenLake-v1, Taxi-v3, CliffWalking-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=false" """
+    """its arguments, such as "map_name=8x8 is_slippery=False" """
     discount: float = 1.0
-    """γ in [0, 1], weight of a reward one step later (the lecture is undiscounted: 1)"""
+    """γ in [0, 1], the weight of a reward one step later"""
+    max_policies: int = 10_000
+    """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (Algorithm 1, line 5), in units of reward"""
+    """V has converged when no V(s) changes by more (relative to the largest |V|, if above 1)"""
     max_iterations: int = 100_000
-    """sweeps of one policy evaluation after which to give up, an error"""
-    max_policies: int = 1_000_000
-    """policy graphs, above which to refuse"""
+    """sweeps after which to give up"""
     output_json: Path | None = None
-    """write values, action values, policy, ties, iterations, residual and history to this file"""
-    figure: Path | None = None
-    """draw the values of policy after policy and, in a grid world, values and policy, to this .png"""
-
-
-def fail(message: str) -> NoReturn:
-    """Bad input: one line on standard error, exit code 2."""
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(2)
-
-
-def parse_args(args_class: type[Flags]) -> Flags:
-    """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
-            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
-    box = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
-    except SystemExit as stop:
-        if stop.code != 2:
-            raise
-        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
-        fail(" ".join(itertools.takewhile(lambda line: not line.startswith(("─", "╰")), lines)) + " (see --help)")
-
-
-def check_settings(discount: float, tolerance: float, max_iterations: int) -> None:
-    """Raises ValueError for a discount outside [0, 1] and for limits that nothing could keep."""
-    if not 0 <= discount <= 1:
-        raise ValueError(f"discount must be in [0, 1], not {discount}")
-    if not 0 < tolerance < math.inf:
-        raise ValueError(f"tolerance must be above 0, not {tolerance}")
-    if max_iterations < 1:
-        raise ValueError(f"max-iterations must be at least 1, not {max_iterations}")
-
-
-def check_outputs(output_json: Path | None, figure: Path | None) -> None:
-    """Raises ValueError where a file could not be written, before an hour of work finds it out."""
-    for path in filter(None, (output_json, figure)):
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise ValueError(f"cannot write {path}: it is a folder, or in none")
-    if figure and figure.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
+    """write values, action values and policy to this file"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
 
-FIGURE_5 = {
-    "start": "s0",
-    "terminal": ["sG"],
-    "transitions": {
-        "s0": {"a1": [[1.0, "s1", 10]], "a2": [[0.6, "s1", 10], [0.4, "s2", 5]]},
-        "s1": {"a1": [[1.0, "sG", 1]]},
-        "s2": {"a1": [[1.0, "sG", 1]], "a2": [[0.7, "sG", 1], [0.3, "s0", 0]]},
-    },
-}  # the lecture's MDP; one outcome = [P(s'|s,a), s', R(s,a,s')]
+FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, terminated), ...]
+    "s0": {"a1": [(1.0, "s1", 10, False)], "a2": [(0.6, "s1", 10, False), (0.4, "s2", 5, False)]},
+    "s1": {"a1": [(1.0, "sG", 1, True)]},
+    "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
+}
 
-
-@dataclass(frozen=True)
-class MDP:
-    """A Markov decision process (§2.4). Pairs (s, a) are rows, in order of state; a terminal state has one empty row.
-
-    states (S,): names, any sequence, so range(10**6) will do.        actions (rows,): name of each row's action.
-    first_row (S,) int: index of each state's first row.              terminal (S,) bool: the goal states 𝒢.
-    P (rows, S) CSR float64: P(s'|s,a), an entry for each outcome.    R (rows,) float64: Σ_s' P(s'|s,a) R(s,a,s').
-    start (S,) float64: probability of starting in s (the lecture: 1 for s0).
-    rewards (outcomes,) float64: R(s,a,s') in the order of P.data; only the printed arithmetic needs it.
-    grid: (height, width) of a world whose first states are the cells of a grid.
-    Raises ValueError, naming state and action, where this is not a decision process.
-    """
-
-    states: Sequence
-    actions: Sequence
-    first_row: np.ndarray
-    P: sparse.csr_array
-    R: np.ndarray
-    start: np.ndarray
-    terminal: np.ndarray
-    rewards: np.ndarray | None = None
-    grid: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        rows, size = self.P.shape
-        arrays = (self.states, self.first_row, self.start, self.terminal)
-        if any(len(array) != size for array in arrays) or not len(self.actions) == len(self.R) == rows:
-            raise ValueError(f"an MDP with P of shape {self.P.shape} has {size} states and {rows} actions and rewards")
-        if self.first_row[0] != 0 or (np.diff(self.first_row, append=rows) < 1).any():
-            raise ValueError("first_row must begin with 0 and give every state at least one row")
-        if not abs(self.start.sum() - 1) <= 1e-9 or not (self.start >= 0).all():
-            raise ValueError("the probabilities of the start states must be at least 0 and sum to 1")
-        if not (self.P.data > 0).all():
-            raise ValueError("every probability that P stores must be above 0 (see P.eliminate_zeros)")
-        ends = self.terminal[self.state_of_row]  # (rows,)
-        total = self.P @ np.ones(size)  # (rows,)
-        for row in np.flatnonzero(~(np.abs(total - ~ends) <= 1e-9))[:1]:
-            what = f"state {self.states[self.state_of_row[row]]}, action {self.actions[row]}"
-            raise ValueError(f"{what}: the probabilities sum to {total[row]:.12g}, not to {int(not ends[row])}")
-        if not np.isfinite(self.R).all() or self.R[ends].any():
-            raise ValueError("every reward must be finite, and 0 in a terminal state")
-
-    @functools.cached_property
-    def state_of_row(self) -> np.ndarray:
-        """(rows,) int: the state s of each pair (s, a)."""
-        return np.repeat(np.arange(len(self.first_row)), np.diff(self.first_row, append=self.P.shape[0]))
-
-    @functools.cached_property
-    def width(self) -> int:
-        """|A_s| if it is the same in every state, else 0."""
-        counts = np.diff(self.first_row, append=self.P.shape[0])  # (S,)
-        return int(counts[0]) if (counts == counts[0]).all() else 0
-
-
-def mdp_from_json(model: dict) -> MDP:
-    """The MDP of `{"start": state, "terminal": [state, …], "transitions": {state: {action: [[P, s', R], …], …}, …}}`.
-
-    "start" may also be {state: probability, …}. Raises ValueError that says where the model is wrong.
-    """
-    if not isinstance(model, dict) or not isinstance(model.get("transitions"), dict) or "start" not in model:
-        raise ValueError('a model is {"start": s, "terminal": [s, …], "transitions": {s: {a: [[P, next s, R], …]}}}')
-    if unknown := set(model) - {"start", "terminal", "transitions"}:
-        raise ValueError(f"unknown key {sorted(unknown)[0]!r} in the model")
-    transitions, terminal = model["transitions"], model.get("terminal", [])
-    if not isinstance(terminal, list) or not all(isinstance(state, str) for state in terminal):
-        raise ValueError('"terminal" must be a list of states')
-    states = list(dict.fromkeys([*transitions, *terminal]))
-    start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
-    if not states:
-        raise ValueError("the model has no states")
-    number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
-    if unknown := [state for state in start if state not in number]:
-        raise ValueError(f"unknown start state {unknown[0]!r}")
-    if not all(map(is_number, start.values())):
-        raise ValueError('"start" must be a state, or {state: probability, …}')
-    actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
-    probabilities, successors, rewards = [], [], []  # the outcomes
-    for state in states:
-        first_row.append(len(actions))
-        choices = transitions.get(state, {})
-        if not isinstance(choices, dict) or bool(choices) == (state in goals):
-            wrong = "is terminal, but has actions" if state in goals else "is not terminal, but has no actions"
-            raise ValueError(f"state {state} {wrong}")
-        for action, outcomes in choices.items() or [("", [])]:
-            for outcome in outcomes if isinstance(outcomes, list) else [outcomes]:
-                what = f"state {state}, action {action}"
-                if not isinstance(outcome, list) or len(outcome) != 3:
-                    raise ValueError(f"{what}: {outcome!r} is not [probability, next state, reward]")
-                probability, successor, reward = outcome
-                if not is_number(probability) or probability < 0:
-                    raise ValueError(f"{what}: {probability!r} is not a probability")
-                if not isinstance(successor, str) or successor not in number:
-                    raise ValueError(f"{what}: unknown next state {successor!r}")
-                if not is_number(reward):
-                    raise ValueError(f"{what}: {reward!r} is not a finite reward")
-                if probability > 0:
-                    probabilities.append(float(probability))
-                    successors.append(number[successor])
-                    rewards.append(float(reward))
-            actions.append(action)
-            outcomes_before.append(len(rewards))
-    shape = (len(actions), len(states))
-    P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
-    # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R, size = (
-        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
-        for factor in (rewards, np.abs(rewards))
-    )
-    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
-    return MDP(
-        states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
-        start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
-        terminal=np.array([state in goals for state in states]),  # (S,)
-    )
-
-
-def is_number(x: object) -> bool:
-    """Is this value of a JSON file a finite number? (Python reads NaN and 1e999 without complaint.)"""
-    return isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
-
-
-def mdp_from_gymnasium(env_id: str, env_kwargs: str) -> MDP:
-    """The MDP of a Gymnasium environment that has its model in `unwrapped.P`: {s: {a: [(P, s', R, terminated), …]}}.
-
-    Gymnasium ends an episode by a flag of the transition: every flagged one leads to one added state, "terminal".
-    """
-    kwargs = {}
-    for item in env_kwargs.split():
-        name, equals, kwargs[name] = item.partition("=")
-        if not equals:
-            raise ValueError(f"--env-kwargs: {item!r} is not name=value")
-        with contextlib.suppress(ValueError):  # what is not JSON, such as 8x8, stays text
-            kwargs[name] = json.loads(kwargs[name].replace("True", "true").replace("False", "false"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # advice about versions, on a run in which nothing is wrong
-        try:
-            try:
-                env = gym.make(env_id, **kwargs).unwrapped
-            except gym.error.DeprecatedEnv:
-                env = gym.make(env_id.rpartition("-v")[0], **kwargs).unwrapped
-                print(f"{env_id} is retired in Gymnasium {gym.__version__}; {env.spec.id} takes its place.\n")
-        except Exception as error:  # whatever the constructor of somebody's environment raises
-            raise ValueError(f"Gymnasium cannot make {env_id} with {kwargs}: {error}") from error
-    if not hasattr(env, "P"):
-        raise ValueError(f"{env_id} has no model (unwrapped.P): its transition probabilities are unknown")
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(env.P))[0])  # (cells,)
-    mdp = mdp_from_json({
-        "start": {str(s): float(probability) for s, probability in enumerate(start)},
-        "terminal": ["terminal"],
-        "transitions": {
-            str(s): {
-                str(a): [[float(p), "terminal" if ended else str(s_next), float(r)] for p, s_next, r, ended in outcomes]
-                for a, outcomes in choices.items()
-            }
-            for s, choices in env.P.items()
-        },
-    })  # fmt: skip
-    shape = tuple(getattr(env, "shape", getattr(getattr(env, "desc", None), "shape", ())))
-    return dataclasses.replace(mdp, grid=shape if len(shape) == 2 and math.prod(shape) == len(env.P) else None)
-
-
-def load_json(path: Path) -> object:
-    """The contents of a JSON file. Raises ValueError for broken syntax (line, column) and for a repeated key."""
-
-    def unique(pairs: list[tuple[str, object]]) -> dict:
-        seen = collections.Counter(key for key, _ in pairs)
-        if seen and max(seen.values()) > 1:
-            raise ValueError(f"{path}: the key {seen.most_common(1)[0][0]!r} occurs twice in one object")
-        return dict(pairs)
-
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=unique)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-
-
-def read_mdp(mdp: Path | None, env_id: str, env_kwargs: str) -> MDP:
-    """The MDP that the flags name: a JSON file, a Gymnasium environment, or else the lecture's Figure 5."""
-    if mdp and env_id:
-        raise ValueError("--mdp and --env-id both name a model: give one of them")
-    if env_kwargs and not env_id:
-        raise ValueError("--env-kwargs needs --env-id")
-    if env_id:
-        return mdp_from_gymnasium(env_id, env_kwargs)
-    return mdp_from_json(load_json(mdp) if mdp else FIGURE_5)
-
-
-@dataclass
-class Solution:
-    """What a script found. NaN stands for the value of a state that the policy does not reach, -1 for its action."""
-
-    V: np.ndarray  # (S,)
-    Q: np.ndarray  # (rows,)
-    policy: np.ndarray  # (S,) int, rows
-    tied: np.ndarray  # (rows,) bool, the actions that are as good as the best
-    iterations: int
-    residual: float  # Bellman residual of V
-    changes: list[float]  # the residual's course, for the figure
-    history: list[dict[str, np.ndarray]]  # {"values": V_i, "action_values": Q_i, "policy": π_i} for i = 0, 1, …
+# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it.
+# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
+# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
+#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
 
 
 # ---- algorithm: exhaustive search ----------------------------------------------------------------
 
 
-def policy_graphs(mdp: MDP) -> Iterator[tuple[int, ...]]:
-    """Every distinct policy graph (§3.2) once, as the rows that it chooses; a state that it never reaches needs none.
-
-    Sets of states are the bits of an int.
-    """
-    bounds = np.append(mdp.first_row, len(mdp.R)).tolist()
-    indptr, indices = mdp.P.indptr.tolist(), mdp.P.indices.tolist()
-    leads = [sum(1 << s for s in set(indices[i:j])) for i, j in itertools.pairwise(indptr)]  # (rows,) successors
-    start, terminal = (sum(1 << s for s in np.flatnonzero(states).tolist()) for states in (mdp.start, mdp.terminal))
-    stack = [((), start, terminal)]
+def policies(P: sparse.csr_array, first_row: np.ndarray, start: np.ndarray) -> Iterator[np.ndarray]:
+    """Every policy (S,) int once: a row for each state that it reaches, -1 elsewhere."""
+    ends = np.append(first_row[1:], P.shape[0])  # (S,)
+    stack = [np.full(len(first_row), -1)]
     while stack:
-        chosen, reached, decided = stack.pop()
-        if not (undecided := reached & ~decided):
-            yield chosen
+        policy = stack.pop()
+        reached = (start > 0) | (P[policy[policy >= 0]].sum(axis=0) > 0)  # (S,)
+        undecided = np.flatnonzero(reached & (policy < 0))
+        if len(undecided) == 0:
+            yield policy
             continue
-        s = (undecided & -undecided).bit_length() - 1  # the lowest bit
-        for row in reversed(range(bounds[s], bounds[s + 1])):
-            stack.append(((*chosen, row), reached | leads[row], decided | 1 << s))
+        s = undecided[0]
+        for row in reversed(range(first_row[s], ends[s])):
+            stack.append(np.where(np.arange(len(policy)) == s, row, policy))
 
 
-def evaluate_graph(
-    mdp: MDP, rows: np.ndarray, discount: float, tolerance: float, max_iterations: int, V_0: np.ndarray
-) -> tuple[np.ndarray, int]:
-    """V^π (S,) of a policy graph, NaN where it is not reached or not finite, and the sweeps it took from V_0."""
-    policy = first_rows(mdp, rows)  # (S,)
-    live = policy >= 0  # (S,) where Equation 3 holds
-    V = np.where(live | (mdp.start > 0), 0, np.nan)  # (S,)
-    V[mdp.P[rows].indices] = 0
-    if discount == 1:
-        caught, paid = caught_states(mdp, rows)
-        if paid.any():
-            if mean_rewards(mdp, policy, paid).min() > 1e-9:
-                where = names(mdp, np.flatnonzero(paid))
-                raise ValueError(f"V* is infinite at discount 1: rewards above 0 can be collected for ever in {where}")
-            return V + np.nan, 0
-        # Easy to get wrong: V(s) = V(s) would keep its first value, of an earlier policy. It must be 0.
-        live &= ~caught
-    P, R = policy_system(mdp, policy, live)
-    V_end, changes, _ = iterative_policy_evaluation(P, R, discount, V_0, tolerance, max_iterations)
-    return V + V_end, len(changes)
+def evaluate(P, R, policy: np.ndarray, warm: np.ndarray, args: Args) -> tuple[np.ndarray, int, int]:
+    """V^π (S,), its sweeps from `warm` (S,), and from V = 0; NaN if π has no value."""
+    states = np.flatnonzero(policy >= 0)  # (n,)
+    P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
+    live = live_states(P_π, R_π, args.discount)  # (n,)
+    V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
+    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
+    limits = args.discount, args.tolerance, args.max_iterations
+    V[states], changes = iterative_policy_evaluation(P_π, R_π, warm[states], *limits)
+    _, changes_from_0 = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
+    return V, len(changes), len(changes_from_0)
 
 
-def mean_rewards(mdp: MDP, policy: np.ndarray, recurrent: np.ndarray) -> np.ndarray:
-    """Mean reward per step of each recurrent class of a policy (S,), of the states `recurrent` (S,) bool."""
-    states = np.flatnonzero(recurrent)
-    P = mdp.P[policy[states]][:, states].toarray()  # (k, k)
-    count, component = csgraph.connected_components(P, connection="strong")
-    means = []
-    for label in range(count):
-        own = component == label  # (k,)
-        # μ = Pᵀ μ, Σ μ = 1: how often each state is visited in the long run
-        equations = np.vstack([np.eye(own.sum()) - P[own][:, own].T, np.ones(own.sum())])  # (n + 1, n)
-        frequency = np.linalg.lstsq(equations, np.eye(own.sum() + 1)[-1], rcond=None)[0]  # (n,)
-        means.append(frequency @ mdp.R[policy[states[own]]])
-    return np.array(means)
+def exhaustive_search(P, R, first_row, start: np.ndarray, args: Args) -> tuple:
+    """Algorithm 2: π* (S,), V* (S,) and, of every policy, (V^π(start), sweeps, sweeps from 0).
 
-
-@dataclass
-class Candidate:
-    """One pass of Algorithm 2: the policy graph, V (S,), V^π(s0), and the sweeps with the warm start and from V = 0."""
-
-    rows: np.ndarray
-    V: np.ndarray
-    value: float
-    sweeps: int
-    cold_sweeps: int
-
-
-def exhaustive_search(
-    mdp: MDP, discount: float, tolerance: float, max_iterations: int, max_policies: int
-) -> tuple[Solution, list[Candidate]]:
-    """Algorithm 2 over the distinct policy graphs: π* with its values, and the first 1,000 candidates.
-
-    Raises ValueError for more than max_policies policy graphs, an infinite V*(s0), and if no policy has a finite value.
+    Exits for more than --max-policies policies, and if one has no value.
     """
-    check_settings(discount, tolerance, max_iterations)
-    count = sum(1 for _ in itertools.islice(policy_graphs(mdp), max_policies + 1))
-    if count > max_policies:
-        number = f"{assignments(mdp)} assignments of actions, ∏|A_s|"
-        raise ValueError(f"there are more than --max-policies {max_policies:,} policy graphs ({number})")
-    settings = (discount, tolerance, max_iterations)
-    current_max, tied, candidates = -math.inf, [], []
-    latest = np.zeros(len(mdp.states))  # (S,) V(s) under the latest policy that reached s
-    for chosen in tqdm(policy_graphs(mdp), "policies", count, delay=2, leave=False):
-        rows = np.sort(np.array(chosen, int))
-        # §4.2: start from the values of the policies before, for the next one differs from the last in few states.
-        V, sweeps = evaluate_graph(mdp, rows, *settings, latest)
-        value = float(mdp.start @ np.where(mdp.start > 0, V, 0))  # V^π(s0)
-        if np.isfinite(value):
-            latest = np.where(np.isnan(V), latest, V)
-        close = 1e-9 * max(1.0, abs(value))
-        if current_max < value - close:  # Algorithm 2, line 6
-            current_max, tied = value, []
-        if abs(value - current_max) <= close:
-            tied.append((rows, V))
-        if len(candidates) < 1000:
-            cold_sweeps = evaluate_graph(mdp, rows, *settings, np.zeros(len(V)))[1]
-            candidates.append(Candidate(rows, V, value, sweeps, cold_sweeps))
-    if not tied:
-        raise ValueError("no policy has a finite value at discount 1: each can be caught where a reward is not 0")
-    rows, V = tied[0]
-    Q = backup(mdp, V, discount)  # (rows,)
-    any_of = np.zeros(len(Q), bool)  # (rows,)
-    any_of[np.concatenate([rows for rows, _ in tied])] = True
-    residual = float(np.abs(Q[rows] - V[mdp.state_of_row[rows]]).max(initial=0))
-    history = [{"values": entry.V, "policy": first_rows(mdp, entry.rows)} for entry in candidates]
-    values = [entry.value for entry in candidates]
-    return Solution(V, Q, first_rows(mdp, rows), any_of, count, residual, values, history), candidates
+    candidates = list(itertools.islice(policies(P, first_row, start), args.max_policies + 1))
+    if len(candidates) > args.max_policies:
+        raise SystemExit(f"error: there are more than {args.max_policies} policies")
+    current_max, best, tried, warm = -np.inf, None, [], np.zeros(len(start))  # warm: (S,)
+    for policy in tqdm(candidates, "exhaustive search", unit=" policies", delay=2, leave=False):
+        V, sweeps, sweeps_from_0 = evaluate(P, R, policy, warm, args)  # Algorithm 2, line 5
+        warm = np.where(policy >= 0, V, warm)  # what the policies have in common is known
+        value = start[start > 0] @ V[start > 0]
+        tried.append((value, sweeps, sweeps_from_0))
+        if current_max < value:  # lines 6-9
+            current_max, best = value, (policy, V)
+    return *best, tried
 
 
-def assignments(mdp: MDP) -> str:
-    """∏ |A_s|, the number of assignments of actions to all states, reached or not."""
-    number = math.prod(np.diff(mdp.first_row, append=len(mdp.R)).tolist())
-    return f"{number:,}" if number < 10**15 else f"about 10^{math.log10(number):.0f}"
+def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
+    """Algorithm 1 from V (n,): V^π (n,), and the largest change in each sweep.
 
-
-def backup(mdp: MDP, V: np.ndarray, discount: float) -> np.ndarray:
-    """Q (rows,) of the values V (S,) by Equation 29: one Bellman backup."""
-    # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R has the rewards summed already
-    Q = mdp.P @ (discount * V)  # (rows,)
-    Q += mdp.R
-    return Q
-
-
-def settled(change: float, V: np.ndarray, tolerance: float) -> bool:
-    """Has V converged: within the tolerance, or within what the spacing of doubles allows?"""
-    return change <= tolerance or change <= 4 * np.finfo(float).eps * np.abs(V).max()
-
-
-def iterative_policy_evaluation(
-    P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndarray, tolerance: float, max_iterations: int
-) -> tuple[np.ndarray, list[float], list[np.ndarray]]:
-    """Algorithm 1 from the values V (S,); P (S, S) and R (S,) are the policy's.
-
-    Returns V^π, max |V_i - V_i-1| for i = 1, 2, …, and [V_0, V_1, …] (of more than 100 states V_0 alone).
-    Raises ValueError if V has not converged after max_iterations.
+    P (n, n) and R (n,) are the policy's own. Exits if V has not converged after max_iterations.
     """
-    changes, history = [math.inf], [V]
-    with tqdm(desc="policy evaluation", unit=" sweeps", delay=2, leave=False) as bar:
-        while not settled(changes[-1], V, tolerance):
-            if len(changes) > max_iterations:
-                last = f"last change {changes[-1]:.3g}"
-                raise ValueError(f"V^π has not converged after --max-iterations {max_iterations:,} ({last})")
-            # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
-            V_next = R + P @ (discount * V)  # (S,)
-            changes.append(float(np.abs(V_next - V).max()))
-            V = V_next
-            history += [V] if len(V) <= 100 else []
-            bar.update()
-    return V, changes[1:], history
+    changes = []
+    for _ in tqdm(range(max_iterations), "policy evaluation", unit=" sweeps", delay=2, leave=False):
+        # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
+        V, V_old = R + discount * (P @ V), V  # (n,)
+        changes.append(float(np.abs(V - V_old).max(initial=0)))
+        if changes[-1] <= tolerance * np.abs(V).max(initial=1):
+            return V, changes
+    raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
-def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
-    """(S,) int: the first of `rows` (indices in ascending order) in each state, -1 where a state has none."""
-    policy = np.full(len(mdp.first_row), -1)  # (S,)
-    policy[mdp.state_of_row[rows[::-1]]] = rows[::-1]  # the last assignment stays
-    return policy
+def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
+    """Q (rows,) of the values V (S,)."""
+    # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
+    return R + discount * (P @ V)  # (rows,)
 
 
-# ---- evaluation: which values are finite without a discount --------------------------------------
+def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
+    """(n,) bool: where a `goal` (n,) bool may be reached by P (n, n), by a fixed point."""
+    reached, before = goal, None
+    while not np.array_equal(reached, before):
+        reached, before = reached | (P @ reached > 0), reached
+    return reached
 
 
-def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
-    """The graph on states, (S, S), with an edge s → s' for every outcome of `rows` (indices in ascending order)."""
-    P = mdp.P[rows]  # (len(rows), S)
-    edges = np.bincount(mdp.state_of_row[rows], np.diff(P.indptr), minlength=P.shape[1])  # (S,) edges out of s
-    graph = sparse.csr_array((P.data, P.indices, np.append(0, np.cumsum(edges)).astype(int)), shape=(P.shape[1],) * 2)
-    graph.sum_duplicates()  # easy to get wrong: given an edge twice, SciPy's connected_components never returns
-    return graph
+def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
+    """(n,) bool: where V^π is to be worked out; elsewhere it is 0. P (n, n) and R (n,) are π's own.
 
-
-def search(graph: sparse.csr_array, sources: np.ndarray) -> np.ndarray:
-    """Breadth-first search from `sources` (S,) bool: predecessors (S,) int; S for a source, < 0 if not found."""
-    root = sparse.csr_array(sources[None].astype(float))  # (1, S), an added node that leads to every source
-    whole = sparse.block_array([[graph, None], [root, sparse.csr_array((1, 1))]], format="csr")  # (S + 1, S + 1)
-    return csgraph.breadth_first_order(whole, len(sources))[1][:-1]
-
-
-def lasting_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
-    """Those of `rows` (indices in ascending order) that can be played for ever: what they lead to, they lead back from.
-
-    Of one row per state these are a policy's recurrent classes; of more, what the literature calls end components.
+    Exits if the policy has no value.
     """
-    while True:
-        component = csgraph.connected_components(state_graph(mdp, rows), connection="strong")[1]  # (S,)
-        P = mdp.P[rows]  # (len(rows), S)
-        own = np.repeat(component[mdp.state_of_row[rows]], np.diff(P.indptr))  # (outcomes,)
-        stays = np.logical_and.reduceat(component[P.indices] == own, P.indptr[:-1])  # (len(rows),) nothing leads out
-        if stays.all():
-            return rows
-        rows = rows[stays]
+    if discount < 1:
+        return np.ones(len(R), bool)
+    # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
+    live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
+    if not ends.all():
+        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
+    return live
 
 
-def caught_states(mdp: MDP, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The states in which a policy of `rows` (one a state) can be caught for ever (S,) bool, and which of them pay.
+# ---- report: reading a model, tables, output -----------------------------------------------------
 
-    A set of states pays if one of its rewards is not 0: it has no finite value at discount 1, the others have value 0.
+
+def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
+    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+
+    Exits with one line if there is none.
     """
-    caught, paid = np.zeros((2, len(mdp.first_row)), bool)
-    rows = lasting_rows(mdp, rows)
-    caught[mdp.state_of_row[rows]] = True
-    paid[mdp.state_of_row[rows[mdp.R[rows] != 0]]] = True
-    return caught, search(state_graph(mdp, rows), paid) >= 0  # one reward that is not 0 spoils the whole set of states
+    if not 0 <= args.discount <= 1:
+        raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
+    items = [item.partition("=") for item in args.env_kwargs.split()]
+    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
+    model, start, grid = FIGURE_5, None, ()
+    try:
+        if args.model:
+            model = json.loads(args.model.read_text("utf-8"))
+        if args.env_id:
+            env = gym.make(args.env_id, **kwargs).unwrapped
+            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
+            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
+        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+    except Exception as error:  # no such file, environment or argument, or it has no model
+        raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
+    return model, np.eye(1, len(model))[0] if start is None else start, grid
 
 
-def policy_system(mdp: MDP, policy: np.ndarray, live: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
-    """P (S, S) and R (S,) of Equation 3, V = R + γ P V, in the states of `live` (S,) bool; elsewhere 0, and so is V."""
-    P = sparse.diags_array(live.astype(float)) @ mdp.P[np.where(live, policy, 0)]  # (S, S)
-    return P, np.where(live, mdp.R[policy], 0.0)
+def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
+    """P (rows, S), R (rows,) and first_row (S,) of a model.
+
+    Exits with one line if a state and action make no sense.
+    """
+    number = {s: i for i, s in enumerate(model)}
+    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    entries, R = [], []
+    for row, (s, a, transitions) in enumerate(rows):
+        p, next_states, rewards, ends = zip(*transitions, strict=True)
+        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
+        finite = np.isfinite(rewards).all()
+        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
+            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
+        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
+        R.append(np.dot(p, rewards))
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
-def names(mdp: MDP, states: np.ndarray) -> str:
-    """The names of some states for a message, at most five of them."""
-    states = np.unique(states)
-    more = f", … ({len(states)} states)" if len(states) > 5 else ""
-    return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
-
-
-# ---- report and checkpoint -----------------------------------------------------------------------
-
-
-def readable(mdp: MDP) -> bool:
-    """Is the MDP small enough to be worked through on paper?"""
-    return len(mdp.R) <= 12
-
-
-def decimal(x: float) -> str:
-    """A number as the lecture prints it: two decimals without trailing zeros (but two digits of what is below 0.1)."""
-    return f"{x:.2g}" if 0 < abs(x) < 0.1 else f"{x + 0:.2f}".rstrip("0").rstrip(".")
-
-
-def worked(mdp: MDP, row: int, discount: float, value: Callable[[int], str]) -> str:
-    """Σ_s' P(s'|s,a) [R(s,a,s') + γ V(s')] of a row as the lecture writes it: `0.6·[10 + V(s1)] + 0.4·[5 + V(s2)]`."""
-    gamma = "" if discount == 1 else f"{discount:g}·"
-    outcomes = range(*mdp.P.indptr[row : row + 2])
-    brackets = (f"{mdp.P.data[k]:.4g}·[{mdp.rewards[k]:g} + {gamma}{value(mdp.P.indices[k])}]" for k in outcomes)
-    return " + ".join(brackets) or "0"
-
-
-def print_table(header: list[str], rows: list[list[str]], most: int = 12) -> None:
-    """Print columns that line up; of more rows than `most` all but the last are left out from there on."""
-    if len(rows) > most:
-        rows = [*rows[: most - 2], ["…"] * len(header), rows[-1]]
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    for row in [header, ["-" * width for width in widths], *rows]:
-        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    print()
-
-
-def print_solution(mdp: MDP, solution: Solution) -> None:
-    """V, π and ties of the first states, the value of the start, and the Bellman residual."""
-    rows = []
-    for s in range(min(len(mdp.states), 20)):
-        rows_of_s = range(mdp.first_row[s], (*mdp.first_row[s + 1 : s + 2], len(mdp.R))[0])
-        ties = ", ".join(str(mdp.actions[row]) for row in rows_of_s if solution.tied[row])
-        action = "-" if mdp.terminal[s] or solution.policy[s] < 0 else str(mdp.actions[solution.policy[s]])
-        value = "undefined" if np.isnan(solution.V[s]) else f"{solution.V[s] + 0:.12g}"
-        rows.append([str(mdp.states[s]), value, action, ties if "," in ties else ""])
-    print_table(["state", "V", "π", "ties"], rows, most=20)
-    if len(mdp.states) > 20:
-        print(f"… and {len(mdp.states) - 20} more states (--output-json FILE writes all of them)")
-    one = f"V({mdp.states[mdp.start.argmax()]})"
-    value = mdp.start @ np.where(mdp.start > 0, solution.V, 0)
-    print(f"{one if mdp.start.max() == 1 else 'Mean V of the states to start from'} = {value:.12g}")
-    print(f"{solution.iterations} iterations, Bellman residual {solution.residual:.3g}")
-
-
-def as_json(mdp: MDP, solution: Solution) -> dict:
-    """The solution as --output-json writes it; a value that is not defined is null."""
-    states, actions = [str(state) for state in mdp.states], [str(action) for action in mdp.actions]
-    bounds = np.append(mdp.first_row, len(mdp.R)).tolist()
-    choices = {state: [] if mdp.terminal[s] else range(*bounds[s : s + 2]) for s, state in enumerate(states)}
-
-    def named(values: np.ndarray, action_values: np.ndarray | None = None, policy: np.ndarray | None = None) -> dict:
-        entry = {"values": dict(zip(states, np.where(np.isnan(values), None, values).tolist(), strict=True))}
-        if action_values is not None:
-            Q = np.where(np.isnan(action_values), None, action_values).tolist()
-            entry["action_values"] = {state: {actions[row]: Q[row] for row in rows} for state, rows in choices.items()}
-        if policy is not None:
-            acting = np.flatnonzero((policy >= 0) & ~mdp.terminal)
-            entry["policy"] = {states[s]: actions[policy[s]] for s in acting}
-        return entry
-
-    ties = {state: [actions[row] for row in rows if solution.tied[row]] for state, rows in choices.items()}
-    return {
-        **named(solution.V, solution.Q, solution.policy),
-        "ties": {state: tied for state, tied in ties.items() if len(tied) > 1},
-        "iterations": solution.iterations,
-        "residual": solution.residual,
-        "history": [named(**entry) for entry in solution.history] if len(states) <= 100 else [],
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
+    q = iter(Q)
+    solution = {
+        "values": dict(zip(model, V, strict=True)),
+        "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},
+        "policy": dict(actions[row] for row in policy[policy >= 0]),
+        "iterations": iterations,
+        "residual": float(residual),
     }
-
-
-def save_json(path: Path | None, contents: object) -> None:
-    """Write --output-json, if it is asked for."""
+    for s, v in zip(list(model)[:20], V, strict=False):
+        text = "undefined" if v is None else round(v, 12)
+        print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
+    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
-        path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def save_figure(
-    path: Path | None, mdp: MDP, solutions: dict[str, Solution], xlabel: str, ylabel: str, yscale: str = "log"
-) -> None:
-    """Draw --figure, if it is asked for: for each solution its convergence and, in a grid, its values and actions.
-
-    Convergence is V of every state where there are at most 10, else `changes`, which `ylabel` describes.
-    """
-    if not path:
-        return
-    columns = 2 if mdp.grid else 1
-    figure = Figure(figsize=(6.4 * columns, 4.4 * len(solutions)), layout="constrained")
-    panels = figure.subplots(len(solutions), columns, squeeze=False)
-    for (title, solution), (curves, *map_panel) in zip(solutions.items(), panels, strict=True):
-        if len(mdp.states) <= 10 and solution.history:
-            for s, state in enumerate(mdp.states):
-                curves.plot([entry["values"][s] for entry in solution.history], marker=".", label=f"V({state})")
-            curves.set(ylabel="V")
-            curves.legend()
-        else:
-            drawn = [y if y > 0 or yscale == "linear" else math.nan for y in solution.changes]  # there is no log of 0
-            curves.plot(range(1, len(drawn) + 1), drawn, marker=".")
-            curves.set(ylabel=ylabel, yscale=yscale)
-        curves.set(title=title, xlabel=xlabel)
-        curves.xaxis.get_major_locator().set_params(integer=True)
-        if mdp.grid:
-            draw_grid(map_panel[0], mdp, solution)
-    figure.savefig(path, dpi=120)
-
-
-def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
-    """V as colours and π as arrows on the grid; a cell in which nobody ever acts (hole, goal, cliff) is left empty."""
-    cells = math.prod(mdp.grid)
-    acting = search(state_graph(mdp, np.arange(len(mdp.R))), mdp.start > 0)[:cells] >= 0  # (cells,)
-    acting &= solution.policy[:cells] >= 0
-    # An action's arrow is its mean step to a neighbouring cell, over all states: where it leads, slips averaged out.
-    P = mdp.P.tocoo()
-    place = np.stack(np.divmod(np.arange(len(mdp.states)), mdp.grid[1]), axis=1)  # (S, 2) row and column
-    step = place[P.col] - place[mdp.state_of_row[P.row]]  # (outcomes, 2)
-    near = (np.abs(step).sum(axis=1) == 1) & (P.col < cells)  # (outcomes,)
-    arrows = {}
-    for action in set(mdp.actions[: mdp.first_row[cells]]):
-        of_action = near & (np.array(mdp.actions) == action)[P.row]  # (outcomes,)
-        mean = P.data[of_action] @ step[of_action]  # (2,)
-        arrows[action] = mean / max(1e-9, np.linalg.norm(mean))
-    image = axes.imshow(np.where(acting, solution.V[:cells], np.nan).reshape(mdp.grid), cmap="viridis")
-    axes.figure.colorbar(image, ax=axes, label="V", shrink=0.8)
-    for s in np.flatnonzero(acting):
-        (y, x), (dy, dx) = place[s], arrows[mdp.actions[solution.policy[s]]]
-        ink = "white" if image.norm(solution.V[s]) < 0.6 else "black"
-        axes.text(x, y - 0.3, f"{solution.V[s]:.3g}", ha="center", va="center", color=ink, fontsize=7)
-        size = {"angles": "xy", "scale_units": "xy", "scale": 2.5, "width": 0.006}
-        axes.quiver(x - 0.2 * dx, y + 0.15 - 0.2 * dy, dx, dy, color=ink, **size)
-    axes.set(title="V and π", xticks=range(mdp.grid[1]), yticks=range(mdp.grid[0]))
+        path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
 # ---- main ----------------------------------------------------------------------------------------
 
 
-def main() -> None:
-    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
-    args = parse_args(Args)
-    try:
-        check_settings(args.discount, args.tolerance, args.max_iterations)
-        check_outputs(args.output_json, args.figure)
-        mdp = read_mdp(args.mdp, args.env_id, args.env_kwargs)
-        settings = (args.discount, args.tolerance, args.max_iterations)
-        solution, candidates = exhaustive_search(mdp, *settings, args.max_policies)
-        print(f"{solution.iterations:,} distinct policy graphs, of ∏|A_s| = {assignments(mdp)} assignments\n")
-        table = []
-        for i, entry in enumerate(candidates, start=1):
-            policy = " ".join(f"{mdp.states[mdp.state_of_row[row]]}={mdp.actions[row]}" for row in entry.rows)
-            value = f"{entry.value:.12g}" if np.isfinite(entry.value) else "not finite"
-            policy = policy if len(policy) <= 60 else policy[:59] + "…"
-            table.append([str(i), policy, value, str(entry.cold_sweeps), str(entry.sweeps)])
-        print_table(["i", "policy", "V(start)", "sweeps from V = 0", "warm start"], table)
-        cold, warm = sum(entry.cold_sweeps for entry in candidates), sum(entry.sweeps for entry in candidates)
-        counted = f" of the first {len(candidates):,} policies" if len(candidates) < solution.iterations else ""
-        print(f"The warm start saves {cold - warm} of {cold} sweeps{counted}.\n")
-        print_solution(mdp, solution)
-        save_json(args.output_json, as_json(mdp, solution))
-        save_figure(args.figure, mdp, {"Exhaustive search": solution}, "policy", "V of the start", "linear")
-    except (ValueError, OSError) as error:
-        fail(" ".join(str(error).split()))
+def main(args: Args) -> None:
+    """Try every policy of the MDP that the flags name, and report the best."""
+    model, start, _ = read_model(args)
+    P, R, first_row = arrays(model)
+    policy, V, tried = exhaustive_search(P, R, first_row, start, args)
+    for i, (value, sweeps, sweeps_from_0) in enumerate(tried[:10], start=1):
+        print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")
+    _, warm, cold = np.sum(tried, axis=0)
+    print(f"{len(tried)} policies, {warm:.0f} sweeps, {cold:.0f} from V = 0\n")
+    Q = backup(P, R, V, args.discount)  # (rows,)
+    residual = np.abs(Q[policy] - V)[policy >= 0].max()
+    report(args.output_json, model, V, Q, policy, len(tried), residual)
 
 
 if __name__ == "__main__":
-    main()
+    sys.stdout.reconfigure(encoding="utf-8")  # a pipe on Windows may not know π
+    main(tyro.cli(Args, description=__doc__))

@@ -1,770 +1,295 @@
 # /// script
 # requires-python = ">=3.10"
-# dependencies = ["numpy>=2.0", "scipy>=1.14", "gymnasium>=1.0", "tyro>=0.9", "tqdm>=4.66", "matplotlib>=3.9"]
+# dependencies = [
+#     "gymnasium>=1.0", "numpy>=2.0", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+# ]
 # ///
-"""Policy iteration: the best policy of a known Markov decision process (§4.4 and Algorithm 4).
+"""Policy iteration: evaluate, improve, repeat (§4.4, Algorithm 4).
 
 Run it
-    python algorithms/policy_iteration.py                           # the lecture's MDP from π², its three tables
-    python algorithms/policy_iteration.py --initial-policy random --seed 7
-    python algorithms/policy_iteration.py --env-id Taxi-v3 --figure taxi.png
-    python algorithms/policy_iteration.py --mdp my_mdp.json --initial-policy "s0=a1 s1=a2" --discount 0.95
+    python algorithms/policy_iteration.py                     # the lecture's MDP, from π2
+    python algorithms/policy_iteration.py --env-id FrozenLake-v1
+    python algorithms/policy_iteration.py --env-id Taxi-v4 --discount 0.99
+    python algorithms/policy_iteration.py --initial-policy "s0=a2 s1=a1 s2=a2"
 
 Measured
-    The first command ends at i = 2 with V* = (11, 1, 4, 0), π* = (a1, a1, a2). FrozenLake-v1 at discount 1: V(0) =
-    0.823529411765 (14/17) after 8 iterations. Taxi-v3 at discount 1 begins with a policy that never ends and
-    finishes with a mean V of 7.93. 10^4, 10^5 and 10^6 random states with 4 actions take 0.04, 0.33 and 7.4 s;
-    QuantEcon's was given up after 40 s on the smallest (benchmarks/known_mdps.py --limit 40, two CPU cores).
+    The first command converges to V* = (11, 1, 4) and π* = (a1, a1, a2) with two policies.
 
 Deviations
-    lecture                      this file                                why
-    ---------------------------  ---------------------------------------  ----------------------------------------------
-    begin with a random policy   with π² (its own example), the first     to see the lecture's tables
-                                 actions, or `--initial-policy`
-    π(s) = argmax Q(s, a)        an action changes for a gain above       tied policies would go round for ever
-                                 `--tolerance` only
-    perform policy evaluation    the linear system of Equations 2 and 3   exact; Algorithm 1 is in policy_evaluation.py
-    nothing of endless policies  where the first one has no finite value  no singular system, and every later policy has
-                                 it is replaced by one that ends          finite values
-    no discount                  `--discount` γ, 1 if not given           to serve other MDPs
+    An action is changed only for a gain: of actions that tie, an argmax may change for ever.
+    Not a random policy but, without --initial-policy, one that may end from everywhere: at discount
+    1 another has no value. From there a loop without rewards that never ends is not looked for.
+    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
-import collections
-import contextlib
-import dataclasses
 import functools
-import inspect
-import io
-import itertools
 import json
-import math
 import sys
-import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy import sparse
-from scipy.sparse import csgraph, linalg
+from scipy.sparse import linalg
 from tqdm import tqdm
-
-Flags = TypeVar("Flags")
 
 # ---- Args ----------------------------------------------------------------------------------------
 
 
 @dataclass
 class Args:
-    """V, Q, rewards and tolerances are in the unit of the rewards, iterations in policies."""
+    """V, Q and rewards have one unit; an iteration evaluates and improves a policy."""
 
-    mdp: Path | None = None
-    """a JSON file with the MDP; without it and --env-id, the lecture's Figure 5"""
+    model: Path | None = None
+    """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """a Gymnasium environment with a model, such as FrozenLake-v1, Taxi-v3, CliffWalking-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=false" """
-    initial_policy: str = ""
-    """"s0=a2 s1=a1 …", "first" (each state's first action), "random", or a .json that --output-json wrote; without it
-    the lecture's π² (Equation 11), or "first" in another MDP"""
-    seed: int = 0
-    """of --initial-policy random"""
+    """its arguments, such as "map_name=8x8 is_slippery=False" """
     discount: float = 1.0
-    """γ in [0, 1], weight of a reward one step later (the lecture is undiscounted: 1)"""
-    tolerance: float = 1e-9
-    """an action is changed only for a gain above this (times |V(s)|, where that is above 1), in units of reward"""
-    max_iterations: int = 100_000
-    """improvements of the policy after which to give up, an error"""
+    """γ in [0, 1], the weight of a reward one step later"""
+    initial_policy: str = ""
+    """such as "s0=a2 s1=a1 s2=a1", the lecture's π2; else one that ends if it can"""
+    max_iterations: int = 1000
+    """policies after which to give up"""
     output_json: Path | None = None
-    """write values, action values, policy, ties, iterations, residual and history to this file"""
-    figure: Path | None = None
-    """draw the course of V and, in a grid world, values and policy, to this .png"""
-
-
-def fail(message: str) -> NoReturn:
-    """Bad input: one line on standard error, exit code 2."""
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(2)
-
-
-def parse_args(args_class: type[Flags]) -> Flags:
-    """Read the command line; a flag that cannot be read ends in one line and exit code 2, not in tyro's box."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a Windows console or pipe may not know π
-            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
-    box = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(box):
-            return tyro.cli(args_class, description=f"{__doc__}\n{inspect.getdoc(args_class)}")
-    except SystemExit as stop:
-        if stop.code != 2:
-            raise
-        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
-        fail(" ".join(itertools.takewhile(lambda line: not line.startswith(("─", "╰")), lines)) + " (see --help)")
-
-
-def check_settings(discount: float, tolerance: float, max_iterations: int) -> None:
-    """Raises ValueError for a discount outside [0, 1] and for limits that nothing could keep."""
-    if not 0 <= discount <= 1:
-        raise ValueError(f"discount must be in [0, 1], not {discount}")
-    if not 0 < tolerance < math.inf:
-        raise ValueError(f"tolerance must be above 0, not {tolerance}")
-    if max_iterations < 1:
-        raise ValueError(f"max-iterations must be at least 1, not {max_iterations}")
-
-
-def check_outputs(output_json: Path | None, figure: Path | None) -> None:
-    """Raises ValueError where a file could not be written, before an hour of work finds it out."""
-    for path in filter(None, (output_json, figure)):
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise ValueError(f"cannot write {path}: it is a folder, or in none")
-    if figure and figure.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--figure {figure}: the name must end in .png, .pdf or .svg")
+    """write values, action values and policy to this file"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
 
-FIGURE_5 = {
-    "start": "s0",
-    "terminal": ["sG"],
-    "transitions": {
-        "s0": {"a1": [[1.0, "s1", 10]], "a2": [[0.6, "s1", 10], [0.4, "s2", 5]]},
-        "s1": {"a1": [[1.0, "sG", 1]]},
-        "s2": {"a1": [[1.0, "sG", 1]], "a2": [[0.7, "sG", 1], [0.3, "s0", 0]]},
-    },
-}  # the lecture's MDP; one outcome = [P(s'|s,a), s', R(s,a,s')]
+FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, terminated), ...]
+    "s0": {"a1": [(1.0, "s1", 10, False)], "a2": [(0.6, "s1", 10, False), (0.4, "s2", 5, False)]},
+    "s1": {"a1": [(1.0, "sG", 1, True)]},
+    "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
+}
 
-
-@dataclass(frozen=True)
-class MDP:
-    """A Markov decision process (§2.4). Pairs (s, a) are rows, in order of state; a terminal state has one empty row.
-
-    states (S,): names, any sequence, so range(10**6) will do.        actions (rows,): name of each row's action.
-    first_row (S,) int: index of each state's first row.              terminal (S,) bool: the goal states 𝒢.
-    P (rows, S) CSR float64: P(s'|s,a), an entry for each outcome.    R (rows,) float64: Σ_s' P(s'|s,a) R(s,a,s').
-    start (S,) float64: probability of starting in s (the lecture: 1 for s0).
-    rewards (outcomes,) float64: R(s,a,s') in the order of P.data; only the printed arithmetic needs it.
-    grid: (height, width) of a world whose first states are the cells of a grid.
-    Raises ValueError, naming state and action, where this is not a decision process.
-    """
-
-    states: Sequence
-    actions: Sequence
-    first_row: np.ndarray
-    P: sparse.csr_array
-    R: np.ndarray
-    start: np.ndarray
-    terminal: np.ndarray
-    rewards: np.ndarray | None = None
-    grid: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        rows, size = self.P.shape
-        arrays = (self.states, self.first_row, self.start, self.terminal)
-        if any(len(array) != size for array in arrays) or not len(self.actions) == len(self.R) == rows:
-            raise ValueError(f"an MDP with P of shape {self.P.shape} has {size} states and {rows} actions and rewards")
-        if self.first_row[0] != 0 or (np.diff(self.first_row, append=rows) < 1).any():
-            raise ValueError("first_row must begin with 0 and give every state at least one row")
-        if not abs(self.start.sum() - 1) <= 1e-9 or not (self.start >= 0).all():
-            raise ValueError("the probabilities of the start states must be at least 0 and sum to 1")
-        if not (self.P.data > 0).all():
-            raise ValueError("every probability that P stores must be above 0 (see P.eliminate_zeros)")
-        ends = self.terminal[self.state_of_row]  # (rows,)
-        total = self.P @ np.ones(size)  # (rows,)
-        for row in np.flatnonzero(~(np.abs(total - ~ends) <= 1e-9))[:1]:
-            what = f"state {self.states[self.state_of_row[row]]}, action {self.actions[row]}"
-            raise ValueError(f"{what}: the probabilities sum to {total[row]:.12g}, not to {int(not ends[row])}")
-        if not np.isfinite(self.R).all() or self.R[ends].any():
-            raise ValueError("every reward must be finite, and 0 in a terminal state")
-
-    @functools.cached_property
-    def state_of_row(self) -> np.ndarray:
-        """(rows,) int: the state s of each pair (s, a)."""
-        return np.repeat(np.arange(len(self.first_row)), np.diff(self.first_row, append=self.P.shape[0]))
-
-    @functools.cached_property
-    def width(self) -> int:
-        """|A_s| if it is the same in every state, else 0."""
-        counts = np.diff(self.first_row, append=self.P.shape[0])  # (S,)
-        return int(counts[0]) if (counts == counts[0]).all() else 0
-
-
-def mdp_from_json(model: dict) -> MDP:
-    """The MDP of `{"start": state, "terminal": [state, …], "transitions": {state: {action: [[P, s', R], …], …}, …}}`.
-
-    "start" may also be {state: probability, …}. Raises ValueError that says where the model is wrong.
-    """
-    if not isinstance(model, dict) or not isinstance(model.get("transitions"), dict) or "start" not in model:
-        raise ValueError('a model is {"start": s, "terminal": [s, …], "transitions": {s: {a: [[P, next s, R], …]}}}')
-    if unknown := set(model) - {"start", "terminal", "transitions"}:
-        raise ValueError(f"unknown key {sorted(unknown)[0]!r} in the model")
-    transitions, terminal = model["transitions"], model.get("terminal", [])
-    if not isinstance(terminal, list) or not all(isinstance(state, str) for state in terminal):
-        raise ValueError('"terminal" must be a list of states')
-    states = list(dict.fromkeys([*transitions, *terminal]))
-    start = model["start"] if isinstance(model["start"], dict) else {str(model["start"]): 1.0}
-    if not states:
-        raise ValueError("the model has no states")
-    number, goals = {state: s for s, state in enumerate(states)}, set(terminal)
-    if unknown := [state for state in start if state not in number]:
-        raise ValueError(f"unknown start state {unknown[0]!r}")
-    if not all(map(is_number, start.values())):
-        raise ValueError('"start" must be a state, or {state: probability, …}')
-    actions, first_row, outcomes_before = [], [], [0]  # the rows; outcomes_before is P's index pointer
-    probabilities, successors, rewards = [], [], []  # the outcomes
-    for state in states:
-        first_row.append(len(actions))
-        choices = transitions.get(state, {})
-        if not isinstance(choices, dict) or bool(choices) == (state in goals):
-            wrong = "is terminal, but has actions" if state in goals else "is not terminal, but has no actions"
-            raise ValueError(f"state {state} {wrong}")
-        for action, outcomes in choices.items() or [("", [])]:
-            for outcome in outcomes if isinstance(outcomes, list) else [outcomes]:
-                what = f"state {state}, action {action}"
-                if not isinstance(outcome, list) or len(outcome) != 3:
-                    raise ValueError(f"{what}: {outcome!r} is not [probability, next state, reward]")
-                probability, successor, reward = outcome
-                if not is_number(probability) or probability < 0:
-                    raise ValueError(f"{what}: {probability!r} is not a probability")
-                if not isinstance(successor, str) or successor not in number:
-                    raise ValueError(f"{what}: unknown next state {successor!r}")
-                if not is_number(reward):
-                    raise ValueError(f"{what}: {reward!r} is not a finite reward")
-                if probability > 0:
-                    probabilities.append(float(probability))
-                    successors.append(number[successor])
-                    rewards.append(float(reward))
-            actions.append(action)
-            outcomes_before.append(len(rewards))
-    shape = (len(actions), len(states))
-    P = sparse.csr_array((np.array(probabilities, float), np.array(successors, int), outcomes_before), shape=shape)
-    # R(s, a) = Σ_s' P(s'|s, a) R(s, a, s')
-    R, size = (
-        sparse.csr_array((P.data * factor, P.indices, P.indptr), shape=shape).sum(axis=1)  # (rows,)
-        for factor in (rewards, np.abs(rewards))
-    )
-    R[np.abs(R) <= 4 * np.finfo(float).eps * size] = 0  # easy to get wrong: 0.1·3 - 0.3·1 is 5.6e-17, and no gain
-    return MDP(
-        states, actions, np.array(first_row), P, R, rewards=np.array(rewards),
-        start=np.array([float(start.get(state, 0)) for state in states]),  # (S,)
-        terminal=np.array([state in goals for state in states]),  # (S,)
-    )
-
-
-def is_number(x: object) -> bool:
-    """Is this value of a JSON file a finite number? (Python reads NaN and 1e999 without complaint.)"""
-    return isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
-
-
-def mdp_from_gymnasium(env_id: str, env_kwargs: str) -> MDP:
-    """The MDP of a Gymnasium environment that has its model in `unwrapped.P`: {s: {a: [(P, s', R, terminated), …]}}.
-
-    Gymnasium ends an episode by a flag of the transition: every flagged one leads to one added state, "terminal".
-    """
-    kwargs = {}
-    for item in env_kwargs.split():
-        name, equals, kwargs[name] = item.partition("=")
-        if not equals:
-            raise ValueError(f"--env-kwargs: {item!r} is not name=value")
-        with contextlib.suppress(ValueError):  # what is not JSON, such as 8x8, stays text
-            kwargs[name] = json.loads(kwargs[name].replace("True", "true").replace("False", "false"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # advice about versions, on a run in which nothing is wrong
-        try:
-            try:
-                env = gym.make(env_id, **kwargs).unwrapped
-            except gym.error.DeprecatedEnv:
-                env = gym.make(env_id.rpartition("-v")[0], **kwargs).unwrapped
-                print(f"{env_id} is retired in Gymnasium {gym.__version__}; {env.spec.id} takes its place.\n")
-        except Exception as error:  # whatever the constructor of somebody's environment raises
-            raise ValueError(f"Gymnasium cannot make {env_id} with {kwargs}: {error}") from error
-    if not hasattr(env, "P"):
-        raise ValueError(f"{env_id} has no model (unwrapped.P): its transition probabilities are unknown")
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(env.P))[0])  # (cells,)
-    mdp = mdp_from_json({
-        "start": {str(s): float(probability) for s, probability in enumerate(start)},
-        "terminal": ["terminal"],
-        "transitions": {
-            str(s): {
-                str(a): [[float(p), "terminal" if ended else str(s_next), float(r)] for p, s_next, r, ended in outcomes]
-                for a, outcomes in choices.items()
-            }
-            for s, choices in env.P.items()
-        },
-    })  # fmt: skip
-    shape = tuple(getattr(env, "shape", getattr(getattr(env, "desc", None), "shape", ())))
-    return dataclasses.replace(mdp, grid=shape if len(shape) == 2 and math.prod(shape) == len(env.P) else None)
-
-
-def load_json(path: Path) -> object:
-    """The contents of a JSON file. Raises ValueError for broken syntax (line, column) and for a repeated key."""
-
-    def unique(pairs: list[tuple[str, object]]) -> dict:
-        seen = collections.Counter(key for key, _ in pairs)
-        if seen and max(seen.values()) > 1:
-            raise ValueError(f"{path}: the key {seen.most_common(1)[0][0]!r} occurs twice in one object")
-        return dict(pairs)
-
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=unique)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-
-
-def read_mdp(mdp: Path | None, env_id: str, env_kwargs: str) -> MDP:
-    """The MDP that the flags name: a JSON file, a Gymnasium environment, or else the lecture's Figure 5."""
-    if mdp and env_id:
-        raise ValueError("--mdp and --env-id both name a model: give one of them")
-    if env_kwargs and not env_id:
-        raise ValueError("--env-kwargs needs --env-id")
-    if env_id:
-        return mdp_from_gymnasium(env_id, env_kwargs)
-    return mdp_from_json(load_json(mdp) if mdp else FIGURE_5)
-
-
-@dataclass
-class Solution:
-    """What a script found. NaN stands for the value of a state that the policy does not reach, -1 for its action."""
-
-    V: np.ndarray  # (S,)
-    Q: np.ndarray  # (rows,)
-    policy: np.ndarray  # (S,) int, rows
-    tied: np.ndarray  # (rows,) bool, the actions that are as good as the best
-    iterations: int
-    residual: float  # Bellman residual of V
-    changes: list[float]  # the residual's course, for the figure
-    history: list[dict[str, np.ndarray]]  # {"values": V_i, "action_values": Q_i, "policy": π_i} for i = 0, 1, …
-
-
-def parse_policy(mdp: MDP, text: str, rng: np.random.Generator) -> np.ndarray:
-    """(S,) int: the row of each state's action, -1 in a state for which `text` names none.
-
-    `text` is "s0=a2 s1=a1 …", "first", "random", or a .json of --output-json. Raises ValueError for unknown names.
-    """
-    if text == "first":
-        return mdp.first_row.copy()
-    if text == "random":
-        return mdp.first_row + rng.integers(np.diff(mdp.first_row, append=len(mdp.R)))
-    if text.endswith(".json"):
-        saved = load_json(Path(text))
-        if not isinstance(saved, dict) or not isinstance(saved.get("policy"), dict):
-            raise ValueError(f'{text} has no "policy": {{state: action, …}}')
-        pairs = list(saved["policy"].items())
-    else:
-        pairs = [tuple(item.rpartition("=")[::2]) for item in text.split()]
-    number = {str(state): s for s, state in enumerate(mdp.states)}
-    bounds = np.append(mdp.first_row, len(mdp.R))  # (S + 1,)
-    policy = np.full(len(mdp.first_row), -1)  # (S,)
-    for state, action in pairs:
-        if state not in number:
-            raise ValueError(f"policy: {state!r} is no state" if state else f"policy: {action!r} is not state=action")
-        s = number[state]
-        choices = [str(name) for name in mdp.actions[bounds[s] : bounds[s + 1]]]
-        if mdp.terminal[s] or action not in choices:
-            raise ValueError(f"policy: state {state} has no action {action!r}")
-        if policy[s] >= 0:
-            raise ValueError(f"policy: state {state} occurs twice")
-        policy[s] = bounds[s] + choices.index(action)
-    return policy
-
-
-def policy_graph(mdp: MDP, policy: np.ndarray) -> np.ndarray:
-    """(S,) bool: the states that an agent following `policy` visits (§3.2). Raises ValueError if one has no action."""
-    reached = search(state_graph(mdp, policy[policy >= 0]), mdp.start > 0) >= 0  # (S,)
-    if (without := reached & (policy < 0) & ~mdp.terminal).any():
-        raise ValueError(f"the policy reaches {names(mdp, np.flatnonzero(without))} but names no action there")
-    return reached
+# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it.
+# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
+# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
+#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
 
 
 # ---- algorithm: policy iteration -----------------------------------------------------------------
 
 
-def policy_iteration(
-    mdp: MDP, policy: np.ndarray, discount: float, tolerance: float, max_iterations: int
-) -> tuple[Solution, np.ndarray]:
-    """Algorithm 4 from `policy` (S,) of rows: the solution, and where the first policy had no finite value, (S,) bool.
+def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
+    """Q (rows,) of the values V (S,)."""
+    # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
+    return R + discount * (P @ V)  # (rows,)
 
-    At discount 1 these states begin with a policy that ends. An improved policy that never ends would go round a loop
-    with V ≤ R + P V, somewhere less; averaged over the loop that says 0 < mean R, so that V* itself is infinite. So all
-    later policies have finite values; each is better than the one before, and none comes back.
-    Raises ValueError where V* is not finite, naming the states, and if π has not converged after max_iterations.
+
+def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
+    """max_a Q(s, a): (rows,) → (S,)."""
+    width = len(Q) // len(first_row)
+    if (first_row == width * np.arange(len(first_row))).all():  # as many actions in every state:
+        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
+    return np.maximum.reduceat(Q, first_row)  # (S,)
+
+
+def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=1000) -> list[tuple]:
+    """Algorithm 4 from `policy` (S,) int, a row for each state: [(π (S,), V^π (S,), Q^π (rows,)),
+    ...], of which the last is the best.
+
+    Exits if a policy has no value, or if π has not converged after max_iterations.
     """
-    check_settings(discount, tolerance, max_iterations)
-    V, lost = np.zeros(len(mdp.first_row)), np.zeros(len(mdp.first_row), bool)  # (S,), (S,)
-    rest, safe = without_discount(mdp) if discount == 1 else (np.array([], int), policy)
-    changes, history, previous, converged = [], [], None, False
-    with tqdm(desc="policy iteration", unit=" policies", delay=2, leave=False) as bar:
-        while not converged:
-            if len(changes) >= max_iterations:
-                last = f"last change of V {changes[-1]:.3g}"
-                raise ValueError(f"π has not converged after --max-iterations {max_iterations:,} ({last})")
-            live = ~mdp.terminal  # (S,) where Equation 3 holds
-            if discount == 1:
-                caught, paid = caught_states(mdp, policy[live])
-                if paid.any() and previous is not None:
-                    where = names(mdp, np.flatnonzero(paid))
-                    raise ValueError(f"V* is infinite at discount 1: a gain can be collected for ever in {where}")
-                if paid.any():
-                    lost = search(state_graph(mdp, policy).T, paid) >= 0
-                    policy = np.where(lost, safe, policy)
-                    caught, _ = caught_states(mdp, policy[live])
-                live = live & ~caught
-            V_before, V = V, solve_policy(*policy_system(mdp, policy, live), discount, V)  # Algorithm 4, line 3
-            Q = backup(mdp, V, discount)  # (rows,)
-            if previous is not None:
-                changes.append(float(np.abs(V - V_before).max()))
-                converged = bool((policy == previous).all())
-            history += [{"values": V, "action_values": Q, "policy": policy}] if len(V) <= 100 else []
-            # π(s) = argmax_a Q^π(s, a)  Algorithm 4, line 5; a tie changes nothing, or π may change for ever
-            choices = Q.copy()  # (rows,)
-            choices[rest] = np.maximum(choices[rest], 0)  # what can go on for ever with reward 0 is worth at least that
-            best = maximum(mdp, choices)  # (S,)
-            better = best > choices[policy] + slack(best, tolerance)  # (S,)
-            argmax = first_rows(mdp, np.flatnonzero(choices >= best[mdp.state_of_row]))  # (S,)
-            previous, policy = policy, np.where(better, argmax, policy)
-            bar.update()
-    residual = float(np.abs(maximum(mdp, Q) - V).max())
-    return Solution(V, Q, previous, tied_rows(mdp, Q, tolerance), len(changes), residual, changes, history), lost
+    steps = []
+    for _ in tqdm(range(max_iterations), "policy iteration", delay=2, leave=False):
+        # Perform policy evaluation on π to find V^π(s)  Algorithm 4, line 3
+        live, V = live_states(P[policy], R[policy], discount), np.zeros(len(policy))  # (S,)
+        V[live] = solve_system(P[policy[live]][:, live], R[policy[live]], discount)
+        Q = backup(P, R, V, discount)  # (rows,)
+        steps.append((policy, V, Q))
+        # π(s) = argmax_a Q^π(s, a)  Algorithm 4, line 5
+        best = maximum(Q, first_row)  # (S,)
+        gain = best - Q[policy] > 1e-9 * np.maximum(1, np.abs(best))  # (S,)
+        # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
+        policy = np.where(gain, greedy_policy(P, R, first_row, Q), policy)
+        if not gain.any():
+            return steps
+    raise SystemExit(f"error: π has not converged in {max_iterations} iterations")
 
 
-def backup(mdp: MDP, V: np.ndarray, discount: float) -> np.ndarray:
-    """Q (rows,) of the values V (S,) by Equation 29: one Bellman backup."""
-    # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R has the rewards summed already
-    Q = mdp.P @ (discount * V)  # (rows,)
-    Q += mdp.R
-    return Q
+def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
+    """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
+    A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
+    if len(R) > 1000:  # a factorization of a random graph fills in; this needs A @ V alone
+        V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
+        if np.abs(A @ V - R).max() <= 1e-10 * max(1.0, np.abs(V).max()):
+            return V
+    return linalg.spsolve(A, R)  # (n,)
 
 
-def maximum(mdp: MDP, Q: np.ndarray) -> np.ndarray:
-    """max_a Q(s, a), (rows,) → (S,). With equally many actions everywhere, whole columns are faster."""
-    if mdp.width:
-        return functools.reduce(np.maximum, Q.reshape(-1, mdp.width).T)  # (S,)
-    return np.maximum.reduceat(Q, mdp.first_row)  # (S,)
+def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
+    """(n,) bool: where a `goal` (n,) bool may be reached by P (n, n), by a fixed point."""
+    reached, before = goal, None
+    while not np.array_equal(reached, before):
+        reached, before = reached | (P @ reached > 0), reached
+    return reached
 
 
-def slack(best: np.ndarray, tolerance: float) -> np.ndarray:
-    """(S,) How far below `best` (S,) still counts as equal: `tolerance` of that value's size where it is above 1.
+def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
+    """(n,) bool: where V^π is to be worked out; elsewhere it is 0. P (n, n) and R (n,) are π's own.
 
-    Easy to get wrong: of the largest |Q| of all, one forbidden action at -1e9 would make ties of good and bad. (But
-    1e-11 of the largest value is what solving and summing leave of it everywhere.)
+    Exits if the policy has no value.
     """
-    size = np.abs(best)  # (S,)
-    return np.maximum(tolerance * np.maximum(1.0, size), 1e-11 * size.max())
+    if discount < 1:
+        return np.ones(len(R), bool)
+    # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
+    live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
+    if not ends.all():
+        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
+    return live
 
 
-def tied_rows(mdp: MDP, Q: np.ndarray, tolerance: float) -> np.ndarray:
-    """(rows,) bool: the actions that come within `tolerance`, or 1e-9 if that is more, of the best of their state."""
-    best = maximum(mdp, Q)  # (S,)
-    return Q >= (best - slack(best, max(1e-9, tolerance)))[mdp.state_of_row]
+def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """π (S,) int, a row for each state. Of the best actions that tie, one that ends soonest."""
+    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
+    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
+    # tied actions take the one with most 0.9^steps to the end, or to where V stays 0.
+    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, 1 - P.sum(axis=1))  # (rows,)
+    near, before = np.zeros(len(V)), None  # (S,)
+    while not np.array_equal(near, before):
+        nearness = np.where(tied, 0.9 * (end + P @ near), -1)  # (rows,)
+        near, before = maximum(nearness, first_row), near  # (S,)
+    rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
+    return rows[np.searchsorted(rows, first_row)]  # (S,) the first of each state
 
 
-def first_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
-    """(S,) int: the first of `rows` (indices in ascending order) in each state, -1 where a state has none."""
-    policy = np.full(len(mdp.first_row), -1)  # (S,)
-    policy[mdp.state_of_row[rows[::-1]]] = rows[::-1]  # the last assignment stays
+# ---- report: reading a model, tables, output -----------------------------------------------------
+
+
+def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
+    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+
+    Exits with one line if there is none.
+    """
+    if not 0 <= args.discount <= 1:
+        raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
+    items = [item.partition("=") for item in args.env_kwargs.split()]
+    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
+    model, start, grid = FIGURE_5, None, ()
+    try:
+        if args.model:
+            model = json.loads(args.model.read_text("utf-8"))
+        if args.env_id:
+            env = gym.make(args.env_id, **kwargs).unwrapped
+            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
+            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
+        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+    except Exception as error:  # no such file, environment or argument, or it has no model
+        raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
+    return model, np.eye(1, len(model))[0] if start is None else start, grid
+
+
+def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
+    """P (rows, S), R (rows,) and first_row (S,) of a model.
+
+    Exits with one line if a state and action make no sense.
+    """
+    number = {s: i for i, s in enumerate(model)}
+    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    entries, R = [], []
+    for row, (s, a, transitions) in enumerate(rows):
+        p, next_states, rewards, ends = zip(*transitions, strict=True)
+        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
+        finite = np.isfinite(rewards).all()
+        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
+            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
+        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
+        R.append(np.dot(p, rewards))
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
+
+
+def read_policy(text: str, model: dict) -> np.ndarray:
+    """π (S,) int, a row for each state, from `s0=a2 s1=a1`; -1 for a state that is not named."""
+    policy = np.full(len(model), -1)
+    places = [(i, f"{s}={a}") for i, s in enumerate(model) for a in model[s]]  # of every row
+    if unknown := set(text.split()) - {name for _, name in places}:
+        raise SystemExit(f"error: {unknown} names no state and action of this model")
+    for row, (state, name) in enumerate(places):
+        if name in text.split():
+            policy[state] = row
     return policy
 
 
-def solve_policy(P: sparse.csr_array, R: np.ndarray, discount: float, V: np.ndarray) -> np.ndarray:
-    """V^π (S,) from Equations 2 and 3 as a linear system; P (S, S) and R (S,) are the policy's, V is a first guess.
-
-    A sparse factorisation fills in: at 3,000 states with random successors it takes seconds. So large systems go to
-    BiCGSTAB, which needs products with P only, and are factorised only where that does not converge (a long chain).
-    """
-    if len(R) > 200:
-        operator = linalg.LinearOperator(P.shape, matvec=lambda x: x - P @ (discount * x), dtype=float)
-        V, _ = linalg.bicgstab(operator, R, x0=V, rtol=1e-13, maxiter=1000)
-        if np.abs(R - operator @ V).max() <= 1e-11 * max(1.0, np.abs(V).max()):
-            return V
-    # V = R + γ P V  Equation 3, that is (I - γ P) V = R
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", linalg.MatrixRankWarning)
-        V = np.atleast_1d(linalg.spsolve((sparse.eye_array(len(R)) - discount * P).tocsc(), R))
-    if not np.isfinite(V).all():
-        raise ValueError("V = R + γ P V has no single solution: somewhere probabilities sum to 1 only by rounding")
-    return V
+def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
+    """Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')] as text, `0.6·[10 + 0] + 0.4·[5 + 0]`."""
+    γ = "" if discount == 1 else f"{discount:g}·"
+    terms = [f"{p:g}·[{r:g} + {γ}{'0' if end else V[str(s)]}]" for p, s, r, end in transitions]
+    return " + ".join(terms)
 
 
-# ---- evaluation: which values are finite without a discount --------------------------------------
+def print_table(header: list[str], rows: list[list[str]]) -> None:
+    """Print the first ten rows in columns that line up, with i = 0, 1, ... before them."""
+    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows[:10]))]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    texts = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
+    print("\n".join(texts), end="\n\n")
 
 
-def state_graph(mdp: MDP, rows: np.ndarray) -> sparse.csr_array:
-    """The graph on states, (S, S), with an edge s → s' for every outcome of `rows` (indices in ascending order)."""
-    P = mdp.P[rows]  # (len(rows), S)
-    edges = np.bincount(mdp.state_of_row[rows], np.diff(P.indptr), minlength=P.shape[1])  # (S,) edges out of s
-    graph = sparse.csr_array((P.data, P.indices, np.append(0, np.cumsum(edges)).astype(int)), shape=(P.shape[1],) * 2)
-    graph.sum_duplicates()  # easy to get wrong: given an edge twice, SciPy's connected_components never returns
-    return graph
+def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
+    """A row of the lecture's table of Q_i(s, a) (rows,), worked out from V_i (S,)."""
+    texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
+    rows = [transitions for actions in model.values() for transitions in actions.values()]
+    return [f"{worked(t, discount, texts)} = {round(q, 2):g}" for t, q in zip(rows, Q, strict=True)]
 
 
-def search(graph: sparse.csr_array, sources: np.ndarray) -> np.ndarray:
-    """Breadth-first search from `sources` (S,) bool: predecessors (S,) int; S for a source, < 0 if not found."""
-    root = sparse.csr_array(sources[None].astype(float))  # (1, S), an added node that leads to every source
-    whole = sparse.block_array([[graph, None], [root, sparse.csr_array((1, 1))]], format="csr")  # (S + 1, S + 1)
-    return csgraph.breadth_first_order(whole, len(sources))[1][:-1]
-
-
-def lasting_rows(mdp: MDP, rows: np.ndarray) -> np.ndarray:
-    """Those of `rows` (indices in ascending order) that can be played for ever: what they lead to, they lead back from.
-
-    Of one row per state these are a policy's recurrent classes; of more, what the literature calls end components.
-    """
-    while True:
-        component = csgraph.connected_components(state_graph(mdp, rows), connection="strong")[1]  # (S,)
-        P = mdp.P[rows]  # (len(rows), S)
-        own = np.repeat(component[mdp.state_of_row[rows]], np.diff(P.indptr))  # (outcomes,)
-        stays = np.logical_and.reduceat(component[P.indices] == own, P.indptr[:-1])  # (len(rows),) nothing leads out
-        if stays.all():
-            return rows
-        rows = rows[stays]
-
-
-def caught_states(mdp: MDP, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The states in which a policy of `rows` (one a state) can be caught for ever (S,) bool, and which of them pay.
-
-    A set of states pays if one of its rewards is not 0: it has no finite value at discount 1, the others have value 0.
-    """
-    caught, paid = np.zeros((2, len(mdp.first_row)), bool)
-    rows = lasting_rows(mdp, rows)
-    caught[mdp.state_of_row[rows]] = True
-    paid[mdp.state_of_row[rows[mdp.R[rows] != 0]]] = True
-    return caught, search(state_graph(mdp, rows), paid) >= 0  # one reward that is not 0 spoils the whole set of states
-
-
-def policy_system(mdp: MDP, policy: np.ndarray, live: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
-    """P (S, S) and R (S,) of Equation 3, V = R + γ P V, in the states of `live` (S,) bool; elsewhere 0, and so is V."""
-    P = sparse.diags_array(live.astype(float)) @ mdp.P[np.where(live, policy, 0)]  # (S, S)
-    return P, np.where(live, mdp.R[policy], 0.0)
-
-
-def policy_towards(mdp: MDP, rows: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """A policy (S,) that surely gets to a terminal state or to a state of `rest`, where it stays; -1 where none does.
-
-    It plays only `rows`, and in the states of `rest` only those (both are indices in ascending order).
-    """
-    policy = np.where(mdp.terminal, mdp.first_row, first_rows(mdp, rest))  # (S,)
-    # From every state a step nearer to the end has positive probability, so that the end is reached with probability 1.
-    nearer = search(state_graph(mdp, rows).T, policy >= 0)  # (S,) the next state on a shortest way
-    P = mdp.P[rows]  # (len(rows), S)
-    row = np.repeat(rows, np.diff(P.indptr))  # (outcomes,)
-    return np.where(policy >= 0, policy, first_rows(mdp, row[P.indices == nearer[mdp.state_of_row[row]]]))
-
-
-def without_discount(mdp: MDP) -> tuple[np.ndarray, np.ndarray]:
-    """What discount 1 needs to know before anything is iterated: (rest, safe).
-
-    rest, int: the rows that can be played for ever with rewards of 0 only, which has the value 0.
-    safe (S,) int: a policy that reaches a terminal state or rest from everywhere, so that its values are finite.
-    Raises ValueError that names the states where V* is infinite, or where no policy has a finite value.
-    """
-    acting = np.flatnonzero(~mdp.terminal[mdp.state_of_row])
-    rest = lasting_rows(mdp, acting[mdp.R[acting] >= 0])
-    if len(gaining := rest[mdp.R[rest] > 0]):
-        where = names(mdp, mdp.state_of_row[gaining])
-        raise ValueError(f"V* is infinite at discount 1: rewards above 0 can be collected for ever in {where}")
-    safe = policy_towards(mdp, acting, rest)
-    if len(hopeless := np.flatnonzero(safe < 0)):
-        where = names(mdp, hopeless)
-        why = "neither a terminal state can be reached nor a loop with rewards of 0"
-        raise ValueError(f"no policy has a finite value at discount 1 in {where}: {why}")
-    return rest, safe
-
-
-def names(mdp: MDP, states: np.ndarray) -> str:
-    """The names of some states for a message, at most five of them."""
-    states = np.unique(states)
-    more = f", … ({len(states)} states)" if len(states) > 5 else ""
-    return ", ".join(str(mdp.states[s]) for s in states[:5]) + more
-
-
-# ---- report and checkpoint -----------------------------------------------------------------------
-
-
-def readable(mdp: MDP) -> bool:
-    """Is the MDP small enough to be worked through on paper?"""
-    return len(mdp.R) <= 12
-
-
-def decimal(x: float) -> str:
-    """A number as the lecture prints it: two decimals without trailing zeros (but two digits of what is below 0.1)."""
-    return f"{x:.2g}" if 0 < abs(x) < 0.1 else f"{x + 0:.2f}".rstrip("0").rstrip(".")
-
-
-def worked(mdp: MDP, row: int, discount: float, value: Callable[[int], str]) -> str:
-    """Σ_s' P(s'|s,a) [R(s,a,s') + γ V(s')] of a row as the lecture writes it: `0.6·[10 + V(s1)] + 0.4·[5 + V(s2)]`."""
-    gamma = "" if discount == 1 else f"{discount:g}·"
-    outcomes = range(*mdp.P.indptr[row : row + 2])
-    brackets = (f"{mdp.P.data[k]:.4g}·[{mdp.rewards[k]:g} + {gamma}{value(mdp.P.indices[k])}]" for k in outcomes)
-    return " + ".join(brackets) or "0"
-
-
-def print_table(header: list[str], rows: list[list[str]], most: int = 12) -> None:
-    """Print columns that line up; of more rows than `most` all but the last are left out from there on."""
-    if len(rows) > most:
-        rows = [*rows[: most - 2], ["…"] * len(header), rows[-1]]
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    for row in [header, ["-" * width for width in widths], *rows]:
-        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    print()
-
-
-def print_solution(mdp: MDP, solution: Solution) -> None:
-    """V, π and ties of the first states, the value of the start, and the Bellman residual."""
-    rows = []
-    for s in range(min(len(mdp.states), 20)):
-        rows_of_s = range(mdp.first_row[s], (*mdp.first_row[s + 1 : s + 2], len(mdp.R))[0])
-        ties = ", ".join(str(mdp.actions[row]) for row in rows_of_s if solution.tied[row])
-        action = "-" if mdp.terminal[s] or solution.policy[s] < 0 else str(mdp.actions[solution.policy[s]])
-        value = "undefined" if np.isnan(solution.V[s]) else f"{solution.V[s] + 0:.12g}"
-        rows.append([str(mdp.states[s]), value, action, ties if "," in ties else ""])
-    print_table(["state", "V", "π", "ties"], rows, most=20)
-    if len(mdp.states) > 20:
-        print(f"… and {len(mdp.states) - 20} more states (--output-json FILE writes all of them)")
-    one = f"V({mdp.states[mdp.start.argmax()]})"
-    value = mdp.start @ np.where(mdp.start > 0, solution.V, 0)
-    print(f"{one if mdp.start.max() == 1 else 'Mean V of the states to start from'} = {value:.12g}")
-    print(f"{solution.iterations} iterations, Bellman residual {solution.residual:.3g}")
-
-
-def as_json(mdp: MDP, solution: Solution) -> dict:
-    """The solution as --output-json writes it; a value that is not defined is null."""
-    states, actions = [str(state) for state in mdp.states], [str(action) for action in mdp.actions]
-    bounds = np.append(mdp.first_row, len(mdp.R)).tolist()
-    choices = {state: [] if mdp.terminal[s] else range(*bounds[s : s + 2]) for s, state in enumerate(states)}
-
-    def named(values: np.ndarray, action_values: np.ndarray | None = None, policy: np.ndarray | None = None) -> dict:
-        entry = {"values": dict(zip(states, np.where(np.isnan(values), None, values).tolist(), strict=True))}
-        if action_values is not None:
-            Q = np.where(np.isnan(action_values), None, action_values).tolist()
-            entry["action_values"] = {state: {actions[row]: Q[row] for row in rows} for state, rows in choices.items()}
-        if policy is not None:
-            acting = np.flatnonzero((policy >= 0) & ~mdp.terminal)
-            entry["policy"] = {states[s]: actions[policy[s]] for s in acting}
-        return entry
-
-    ties = {state: [actions[row] for row in rows if solution.tied[row]] for state, rows in choices.items()}
-    return {
-        **named(solution.V, solution.Q, solution.policy),
-        "ties": {state: tied for state, tied in ties.items() if len(tied) > 1},
-        "iterations": solution.iterations,
-        "residual": solution.residual,
-        "history": [named(**entry) for entry in solution.history] if len(states) <= 100 else [],
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
+    q = iter(Q)
+    solution = {
+        "values": dict(zip(model, V, strict=True)),
+        "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},
+        "policy": dict(actions[row] for row in policy[policy >= 0]),
+        "iterations": iterations,
+        "residual": float(residual),
     }
-
-
-def save_json(path: Path | None, contents: object) -> None:
-    """Write --output-json, if it is asked for."""
+    for s, v in zip(list(model)[:20], V, strict=False):
+        text = "undefined" if v is None else round(v, 12)
+        print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
+    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
-        path.write_text(json.dumps(contents, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def save_figure(
-    path: Path | None, mdp: MDP, solutions: dict[str, Solution], xlabel: str, ylabel: str, yscale: str = "log"
-) -> None:
-    """Draw --figure, if it is asked for: for each solution its convergence and, in a grid, its values and actions.
-
-    Convergence is V of every state where there are at most 10, else `changes`, which `ylabel` describes.
-    """
-    if not path:
-        return
-    columns = 2 if mdp.grid else 1
-    figure = Figure(figsize=(6.4 * columns, 4.4 * len(solutions)), layout="constrained")
-    panels = figure.subplots(len(solutions), columns, squeeze=False)
-    for (title, solution), (curves, *map_panel) in zip(solutions.items(), panels, strict=True):
-        if len(mdp.states) <= 10 and solution.history:
-            for s, state in enumerate(mdp.states):
-                curves.plot([entry["values"][s] for entry in solution.history], marker=".", label=f"V({state})")
-            curves.set(ylabel="V")
-            curves.legend()
-        else:
-            drawn = [y if y > 0 or yscale == "linear" else math.nan for y in solution.changes]  # there is no log of 0
-            curves.plot(range(1, len(drawn) + 1), drawn, marker=".")
-            curves.set(ylabel=ylabel, yscale=yscale)
-        curves.set(title=title, xlabel=xlabel)
-        curves.xaxis.get_major_locator().set_params(integer=True)
-        if mdp.grid:
-            draw_grid(map_panel[0], mdp, solution)
-    figure.savefig(path, dpi=120)
-
-
-def draw_grid(axes: Axes, mdp: MDP, solution: Solution) -> None:
-    """V as colours and π as arrows on the grid; a cell in which nobody ever acts (hole, goal, cliff) is left empty."""
-    cells = math.prod(mdp.grid)
-    acting = search(state_graph(mdp, np.arange(len(mdp.R))), mdp.start > 0)[:cells] >= 0  # (cells,)
-    acting &= solution.policy[:cells] >= 0
-    # An action's arrow is its mean step to a neighbouring cell, over all states: where it leads, slips averaged out.
-    P = mdp.P.tocoo()
-    place = np.stack(np.divmod(np.arange(len(mdp.states)), mdp.grid[1]), axis=1)  # (S, 2) row and column
-    step = place[P.col] - place[mdp.state_of_row[P.row]]  # (outcomes, 2)
-    near = (np.abs(step).sum(axis=1) == 1) & (P.col < cells)  # (outcomes,)
-    arrows = {}
-    for action in set(mdp.actions[: mdp.first_row[cells]]):
-        of_action = near & (np.array(mdp.actions) == action)[P.row]  # (outcomes,)
-        mean = P.data[of_action] @ step[of_action]  # (2,)
-        arrows[action] = mean / max(1e-9, np.linalg.norm(mean))
-    image = axes.imshow(np.where(acting, solution.V[:cells], np.nan).reshape(mdp.grid), cmap="viridis")
-    axes.figure.colorbar(image, ax=axes, label="V", shrink=0.8)
-    for s in np.flatnonzero(acting):
-        (y, x), (dy, dx) = place[s], arrows[mdp.actions[solution.policy[s]]]
-        ink = "white" if image.norm(solution.V[s]) < 0.6 else "black"
-        axes.text(x, y - 0.3, f"{solution.V[s]:.3g}", ha="center", va="center", color=ink, fontsize=7)
-        size = {"angles": "xy", "scale_units": "xy", "scale": 2.5, "width": 0.006}
-        axes.quiver(x - 0.2 * dx, y + 0.15 - 0.2 * dy, dx, dy, color=ink, **size)
-    axes.set(title="V and π", xticks=range(mdp.grid[1]), yticks=range(mdp.grid[0]))
+        path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
 # ---- main ----------------------------------------------------------------------------------------
 
 
-def print_policy_tables(mdp: MDP, discount: float, history: list[dict[str, np.ndarray]]) -> None:
-    """The lecture's three tables (§4.4): V^π(s), Q^π(s, a) and π(s) of each iteration."""
-    acting = np.flatnonzero(~mdp.terminal[mdp.state_of_row])
-    pairs = [f"Q({mdp.states[mdp.state_of_row[row]]}, {mdp.actions[row]})" for row in acting]
-    V_cells, Q_cells, policy_cells = [], [], []
-    for i, entry in enumerate(history):
-        V, Q, policy = entry.values()
-        text = [worked(mdp, row, discount, lambda s, V=V: decimal(V[s])) for row in range(len(Q))]
-        # Like the lecture: from i = 1 on with the arithmetic where there is more than one outcome.
-        mixed = np.diff(mdp.P.indptr)[policy] > 1  # (S,)
-        arithmetic = [f"{text[row]} = " if i and mixed[s] else "" for s, row in enumerate(policy)]
-        V_cells.append([str(i), *(arithmetic[s] + decimal(V[s]) for s in range(len(V)))])
-        Q_cells.append([str(i), *(f"{text[row]} = {decimal(Q[row])}" for row in acting)])
-        policy_cells.append([str(i), *(str(mdp.actions[row]) for row in policy[~mdp.terminal])])
-    print_table(["i", *(f"V({state})" for state in mdp.states)], V_cells)
-    print_table(["i", *pairs], Q_cells)
-    print_table(["i", *(f"π({mdp.states[s]})" for s in np.flatnonzero(~mdp.terminal))], policy_cells)
-
-
-def main() -> None:
-    """Read the flags and the MDP, solve it, report; bad input ends in one line."""
-    args = parse_args(Args)
-    try:
-        check_settings(args.discount, args.tolerance, args.max_iterations)
-        check_outputs(args.output_json, args.figure)
-        mdp = read_mdp(args.mdp, args.env_id, args.env_kwargs)
-        text = args.initial_policy or ("first" if args.mdp or args.env_id else "s0=a2 s1=a1 s2=a1")
-        initial = parse_policy(mdp, text, np.random.default_rng(args.seed))
-        policy_graph(mdp, initial)
-        initial = np.where(initial < 0, mdp.first_row, initial)  # a state that is not reached begins with any action
-        solution, lost = policy_iteration(mdp, initial, args.discount, args.tolerance, args.max_iterations)
-        if lost.any():
-            where = names(mdp, np.flatnonzero(lost))
-            print(f"The initial policy has no finite value in {where}: there a policy that ends takes its place.\n")
-        if readable(mdp):
-            print_policy_tables(mdp, args.discount, solution.history)
-        print_solution(mdp, solution)
-        save_json(args.output_json, as_json(mdp, solution))
-        save_figure(args.figure, mdp, {"Policy iteration": solution}, "iteration i", "max |V_i - V_i-1|")
-    except (ValueError, OSError) as error:
-        fail(" ".join(str(error).split()))
+def main(args: Args) -> None:
+    """Improve the policy that the flags name until it is the best, and report."""
+    model, _, _ = read_model(args)
+    P, R, first_row = arrays(model)
+    lecture = "" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1"  # π2 of §3.2
+    policy = greedy_policy(P, 1 + 0 * R, first_row, 0 * R)  # (S,) all actions tie: it ends soonest
+    if args.initial_policy or lecture:
+        policy = read_policy(args.initial_policy or lecture, model)  # (S,)
+    if policy.min() < 0:
+        raise SystemExit("error: --initial-policy needs an action in every state")
+    steps = policy_iteration(P, R, first_row, policy, args.discount, args.max_iterations)
+    policy, V, Q = steps[-1]
+    if len(R) <= 12:  # small enough to be worked through on paper
+        shown = [*steps, steps[-1]]  # the lecture's last row: π has not changed
+        V_rows = [[f"{round(v, 2):g}" for v in V_i] for _, V_i, _ in shown]
+        print_table([f"V_i({s})" for s in model], V_rows)
+        rows = [q_row(model, Q_i, V_i, args.discount) for _, V_i, Q_i in shown]
+        print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], rows)
+        names = [a for s in model for a in model[s]]  # of every row
+        print_table([f"π_i({s})" for s in model], [[names[row] for row in π] for π, _, _ in shown])
+    residual = np.abs(maximum(Q, first_row) - V).max()
+    report(args.output_json, model, V, Q, policy, len(steps), residual)
 
 
 if __name__ == "__main__":
-    main()
+    sys.stdout.reconfigure(encoding="utf-8")  # a pipe on Windows may not know π
+    main(tyro.cli(Args, description=__doc__))
