@@ -1,0 +1,789 @@
+# /// script
+# requires-python = ">=3.10"
+# dependencies = [
+#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
+#     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
+# ]
+# ///
+r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
+§7.3.2): dqn_atari.py, whose simulator and whose one process are the bottleneck, made parallel.
+
+    simulators      step 1   step 2   step 3    a process each; they step while the network learns
+    network       a₁       a₂       a₃          one batch of states, one action for each simulator
+    updates         those due while the simulators step
+    processes       θ is the same in all: after each update's backward pass its gradient is averaged
+
+Run it
+    python algorithms/dqn_atari_parallel.py --num-simulators 8 --agent-update-frequency 4
+    python algorithms/dqn_atari_parallel.py --resume runs/RUN
+    torchrun --nproc-per-node 2 algorithms/dqn_atari_parallel.py      # 2 processes, or 2 GPUs
+    torchrun --nnodes 2 --nproc-per-node 2 --rdzv-backend c10d --rdzv-id 1 \
+        --rdzv-endpoint FIRST_MACHINE:29400 algorithms/dqn_atari_parallel.py   # on both machines
+
+Measured: see README
+
+Deviations
+    Algorithm 6                           this file                           why
+    ------------------------------------  ----------------------------------  --------------------
+    a frame, then its update              updates due while the frames of a   both at once; Q-learn-
+                                          step are made do not see them yet   ing is off-policy
+    counts go up by 1                     by a step of all simulators of all  they step together
+                                          processes; what falls due within a
+                                          step is done once, at the step
+    ℬ ⊆ 𝒟                                 every process draws its share of    the update learns from
+                                          ℬ from its own part of 𝒟            as many transitions
+    Σ_j over ℬ (line 22)                  divided by the processes            Adam does not mind;
+                                                                              RMSprop does a little
+    Every number of Table 3 is a total over the processes; --num-simulators is for each of them.
+    A run that is resumed has its networks, optimizer and counts again. Its replay memory is filled
+    anew, up to the initial size, before it learns on. dqn_atari.py's own are exact.
+    Whoever resumes on several machines needs runs/ on all of them. The other deviations are those
+    of dqn_atari.py.
+"""
+
+import copy
+import dataclasses
+import datetime
+import functools
+import json
+import math
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+import ale_py
+import cv2
+import filelock
+import gymnasium as gym
+import lz4.block
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.wrappers import ClipReward, RecordEpisodeStatistics, TransformObservation
+from torch import distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+REPORT_INTERVAL = 2_000  # frames between two points of a curve
+
+# ---- Args ----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Args:
+    """A FRAME is what the agent observes: one action, 4 emulator frames. Every count is in frames.
+    An EPISODE is one life while training; a GAME ends with the last life."""
+
+    # Table 3, in its order
+    environment_train_frames_max: int = 10_000_000
+    """frames to train for [8: 50,000,000]"""
+    environment_evaluation_episodes: int = 10
+    """games of an evaluation"""
+    environment_evaluation_interval_episodes: int = 500
+    """episodes between evaluations"""
+    environment_checkpoint_interval_episodes: int = 500
+    """episodes between two writings of q_network.pt"""
+    environment_no_op_max: int = 30
+    """a game starts with up to this many no-operations, in emulator frames"""
+    environment_reward_clip_limit: float = 1.0
+    """while training, rewards are clipped to [-limit, limit]"""
+    environment_frames_to_maxpool: int = 2
+    """last emulator frames whose pixelwise maximum is the screen"""
+    environment_state_height: int = 84
+    """height of a frame, pixels"""
+    environment_state_width: int = 84
+    """width of a frame, pixels"""
+    agent_history_length: int = 4
+    """frames in a state"""
+    agent_action_repeat: int = 4
+    """emulator frames for which an action is repeated"""
+    agent_update_frequency: int = 1
+    """actions from one update to the next [8: 4]"""
+    agent_discount_factor: float = 0.99
+    """γ of a frame"""
+    agent_epsilon_greedy_epsilon_initial: float = 1.0
+    """ε, probability of a random action, at frame 0"""
+    agent_epsilon_greedy_epsilon_final: float = 0.01
+    """ε once annealed [8: 0.1]"""
+    agent_epsilon_greedy_annealing: int = 1_000_000
+    """frames over which ε falls linearly"""
+    agent_epsilon_greedy_epsilon_evaluation: float = 0.05
+    """ε while evaluating"""
+    agent_replay_buffer_initial: int = 100_000
+    """transitions in the replay memory before learning starts [8: 50,000]"""
+    agent_replay_buffer_maximum_length: int = 1_000_000
+    """transitions that the replay memory holds; the oldest give way"""
+    optimizer_name: Literal["Adam", "RMSprop"] = "Adam"
+    """Adam, or the RMSProp of [8] with the constants of Figure 18"""
+    optimizer_minibatch_size: int = 32
+    """transitions in a minibatch"""
+    optimizer_q_network_parameter_update_interval_frames: int = 1_000
+    """frames between copies of θ to the target network [8: 10,000 updates = 40,000 frames]"""
+    optimizer_learning_rate: float = 0.0001
+    """learning rate [8: 0.00025]"""
+
+    # This script's own
+    env_id: str = "PongNoFrameskip-v4"
+    """game, by any of its Gymnasium names; PongNoFrameskip-v4 and ALE/Pong-v5 mean the same here"""
+    seed: int = 1
+    """of the weights, exploration, minibatches, no-operations and evaluations"""
+    environment_test_frames: int = 135_000
+    """frames of the final test, and the most of an evaluation [§7.3.3]"""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """of the network; auto is CUDA if there is one, else the CPU"""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """of an update's layers"""
+    num_simulators: int = 8
+    """simulators of each process of torchrun"""
+    threads: int = 0
+    """CPU threads of PyTorch; 0 is PyTorch's own choice"""
+    checkpoint_interval_minutes: float = 10.0
+    """minutes between checkpoints of the learner"""
+    resume: str = ""
+    """run directory to go on with; only --environment-train-frames-max may be raised"""
+    runs_dir: str = "runs"
+    """folder for the run directory"""
+
+
+def read_args() -> Args:
+    """The flags, or those of the run to resume. Exits with one line where no run can use them."""
+    args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+    if args.resume:
+        try:
+            saved = Args(**json.loads((Path(args.resume) / "args.json").read_text()))
+        except (OSError, ValueError, TypeError) as error:
+            raise SystemExit(f"error: {args.resume} is no run directory: {error}") from None
+        args = tyro.cli(Args, default=saved)
+        changed = {name for name, value in vars(args).items() if value != getattr(saved, name)}
+        if not changed <= {"resume", "environment_train_frames_max"}:
+            raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
+    for name, value in vars(args).items():
+        share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
+        low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
+        if type(value) in (int, float) and not low <= value <= (1 if share else math.inf):
+            raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
+    if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
+        raise SystemExit("error: --agent-replay-buffer-initial is above the maximum length")
+    return args
+
+
+# ---- problem: the Atari environment and its wrappers ---------------------------------------------
+#
+#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12   60 a second
+#   action           a₁ ────────  a₂ ────────  a₃ ─────── repeated 4 times, rewards summed
+#   max-pool               3∨4         7∨8       11∨12    some sprites are drawn every other frame
+#   frame          x₀       x₁          x₂          x₃    grey, 84×84: the agent's unit of time
+#   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
+
+
+class JoystickActions(gym.ActionWrapper):
+    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3): `meanings`."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        minimal = env.unwrapped.get_action_meanings()
+        joystick = ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")
+        self.meanings = [name for name in minimal if name in joystick]
+        self.indices = [minimal.index(name) for name in self.meanings]
+        self.action_space = gym.spaces.Discrete(len(self.meanings))
+
+    def action(self, action: int) -> int:
+        return self.indices[action]
+
+
+class NoOpReset(gym.Wrapper):
+    """A game starts with 0 to `no_op_max` no-operations, emulator frames, from `rng` (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
+        super().__init__(env)
+        self.no_op_max, self.rng = no_op_max, rng
+
+    def reset(self, **kwargs):
+        screen, info = self.env.reset(**kwargs)
+        for _ in range(self.rng.integers(self.no_op_max + 1)):
+            screen, _, _, _, info = self.env.step(0)
+        return screen, info
+
+
+class ActionRepeat(gym.Wrapper):
+    """An action lasts `repeat` emulator frames, or until the game ends; its rewards are summed, and
+    the pixelwise maximum of the last `pool` screens is the screen, colour by colour (§7.2.1)."""
+
+    def __init__(self, env: gym.Env, repeat: int, pool: int):
+        super().__init__(env)
+        self.repeat, self.pool = repeat, pool
+
+    def step(self, action: int):
+        total_reward, screens = 0.0, []
+        for _ in range(self.repeat):
+            screen, reward, terminated, truncated, info = self.env.step(action)
+            total_reward += reward
+            screens.append(screen)  # (210, 160, 3) uint8
+            if terminated or truncated:
+                break
+        screen = np.maximum.reduce(screens[-self.pool :])  # (210, 160, 3) uint8
+        return screen, total_reward, terminated, truncated, info
+
+
+class LifeLoss(gym.Wrapper):
+    """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
+
+    Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
+    it reset the emulator, the later lives would never be seen; if it stepped, a frame would be.
+    """
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.lives, self.game_over = 0, True
+
+    def reset(self, **kwargs):
+        if self.game_over:
+            self.frame, self.info = self.env.reset(**kwargs)
+            self.lives, self.game_over = self.info["lives"], False
+        return self.frame, self.info
+
+    def step(self, action: int):
+        self.frame, reward, terminated, truncated, self.info = self.env.step(action)
+        life_lost = self.info["lives"] < self.lives
+        self.lives, self.game_over = self.info["lives"], terminated or truncated
+        return self.frame, reward, terminated or life_lost, truncated, self.info
+
+
+class FrameHistory(gym.Wrapper):
+    """The state: references to the last `length` frames, oldest first, as LZ4 bytes (§7.3.2). A
+    frame is compressed once, when it arrives. An episode's first state repeats its first frame."""
+
+    def __init__(self, env: gym.Env, length: int):
+        super().__init__(env)
+        self.length = length
+
+    def reset(self, **kwargs):
+        frame, info = self.env.reset(**kwargs)
+        self.history = (lz4.block.compress(frame),) * self.length
+        return self.history, info
+
+    def step(self, action: int):
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        self.history = (*self.history[1:], lz4.block.compress(frame))
+        return self.history, reward, terminated, truncated, info
+
+
+def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.Env:
+    """The game with the transformations of Figure 16 (training) or 17 (without the last `if`).
+
+    Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
+    Exits with one line for a name that is no Atari game.
+    """
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
+    gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
+    try:
+        env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
+                       full_action_space=False, max_num_frames_per_episode=108_000)
+    except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
+        raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
+    env = JoystickActions(env)
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0
+    env = NoOpReset(env, no_ops, no_op_rng)
+    env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
+    size = (args.environment_state_width, args.environment_state_height)
+    pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
+    env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
+    env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
+    env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
+    if training:
+        limit = args.environment_reward_clip_limit
+        env = LifeLoss(ClipReward(env, -limit, limit))
+    return env
+
+
+def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> gym.Env:
+    """The game, up to the frame, in a process of its own; it ends when its pipe is closed. The
+    process with the number `learner` makes one, too, to see what it is like."""
+    if os.getpid() != learner:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the learner alone answers signals:
+        if os.name == "posix":
+            os.setsid()  # neither the terminal's nor torchrun's reach another session
+        sys.stderr = open(os.devnull, "w")  # the learner hears of errors through the pipe
+    return make_env(args, no_op_rng, training=True)
+
+
+# ---- memory: lazy replay -------------------------------------------------------------------------
+
+
+class ReplayShare:
+    """One process's part of 𝒟: its last `capacity` transitions (§5.3). One is references to its 5
+    frames, an action, a clipped reward and whether s' is terminal; arrays are made when a minibatch
+    is drawn (§7.3.2). Each is whole in itself, so none can mix two episodes or two simulators."""
+
+    def __init__(self, capacity: int, shape: tuple[int, int], device: str):
+        self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
+        self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
+        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def add(self, s: tuple, a: int, r: float, s_next: tuple, terminal: bool) -> None:
+        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`, or a game
+        that was cut off teaches that its last state is worth nothing."""
+        i = self.added % self.capacity
+        self.frames[i] = (*s, s_next[-1])
+        self.numbers[i] = a, r, terminal
+        self.added += 1
+
+    def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
+        """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
+        s' like s, terminal (B,) bool, on the device."""
+        frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
+        frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
+        # one (B, 3) array travels to the device; (B,) each
+        a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
+        return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
+
+    def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
+        """n LZ4 frames to (n, 84, 84) uint8 on the device."""
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
+
+
+# ---- network -------------------------------------------------------------------------------------
+
+
+class QNetwork(nn.Module):
+    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32."""
+
+    def __init__(self, history_length: int, height: int, width: int, num_actions: int):
+        super().__init__()
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
+        self.layers = nn.Sequential(
+            nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
+            nn.Conv2d(32, 64, 4, stride=2), nn.ReLU(inplace=True),  # (B, 64, 9, 9)
+            nn.Conv2d(64, 64, 3, stride=1), nn.ReLU(inplace=True), nn.Flatten(),  # (B, 3136)
+            nn.Linear(64 * height * width, 512), nn.ReLU(inplace=True),  # (B, 512)
+        )
+        self.head = nn.Linear(512, num_actions)  # (B, num_actions)
+
+    def forward(self, states: torch.Tensor) -> torch.Tensor:
+        x = self.layers(states / 255)  # (B, 512)
+        with torch.autocast(x.device.type, enabled=False):  # Q keeps float32's digits
+            return self.head(x.float())  # (B, num_actions)
+
+
+def initialize_orthogonal(q_network: QNetwork) -> None:
+    """Orthogonal convolution filters (§7.5.1); everything else stays PyTorch's default."""
+    for i in (0, 2, 4):
+        nn.init.orthogonal_(q_network.layers[i].weight)
+
+
+# ---- algorithm: deep Q-learning ------------------------------------------------------------------
+
+
+class NatureRMSprop(torch.optim.Optimizer):
+    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the
+    root. PyTorch's adds it outside; "gradient momentum 0.95" is the decay of the mean gradient."""
+
+    def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
+        super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
+
+    @torch.no_grad()
+    def step(self) -> None:
+        for group in self.param_groups:
+            for θ in group["params"]:
+                state = self.state[θ]
+                if not state:
+                    state["g"], state["n"] = torch.zeros_like(θ), torch.zeros_like(θ)
+                # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
+                g = state["g"].lerp_(θ.grad, 1 - group["decay"])
+                n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
+                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
+                θ.addcdiv_(θ.grad, root, value=-group["lr"])
+
+
+def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
+    """Table 3's Adam, or Figure 18's RMSProp."""
+    if args.optimizer_name == "Adam":
+        return torch.optim.Adam(q_network.parameters(), lr=args.optimizer_learning_rate, fused=True)
+    return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
+
+
+def epsilon_at(frame: int, args: Args) -> float:
+    """ε: linear from ε_initial at frame 0 to ε_final at frame `annealing`, then constant."""
+    initial = args.agent_epsilon_greedy_epsilon_initial
+    final = args.agent_epsilon_greedy_epsilon_final
+    return initial + min(frame / args.agent_epsilon_greedy_annealing, 1.0) * (final - initial)
+
+
+@torch.inference_mode()
+def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
+    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
+    is (4, 84, 84) uint8."""
+    if rng.random() < epsilon:
+        return int(rng.integers(q_network.head.out_features))
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
+
+
+@torch.inference_mode()
+def epsilon_greedy_batch(q_network, states: torch.Tensor, epsilon: float, rng) -> np.ndarray:
+    """`epsilon_greedy` for each of the states (N, 4, 84, 84) uint8: N actions from one batch."""
+    actions = rng.integers(q_network.head.out_features, size=len(states))  # (N,)
+    greedy = rng.random(len(states)) >= epsilon  # (N,)
+    if greedy.any():
+        actions[greedy] = q_network(states[greedy]).argmax(dim=1).cpu()
+    return actions
+
+
+def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
+    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
+    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
+    `minibatch` is what ReplayMemory.gather returns."""
+    s, a, r, s_next, terminal = minibatch
+    with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        # y_j = r_j                                     if s_{j+1} is terminal
+        #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)       else                       (Equation 37)
+        with torch.no_grad():
+            y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
+
+        # Q(s_j, a_j; θ)
+        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
+
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
+    # as in line 22: RMSProp's constant is meant for it, and Adam does not mind.
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
+    assert q.shape == y.shape == r.shape
+    loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss.detach() / len(r), q.detach()
+
+
+def passed(count: int, step: int, interval: int) -> bool:
+    """Whether there is a multiple of `interval` among the last `step` numbers up to `count`."""
+    return count // interval > (count - step) // interval
+
+
+# ---- evaluation ----------------------------------------------------------------------------------
+
+
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
+    """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
+
+    Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
+    and the random actions. Returns [(score, length in frames) of every finished game], and of the
+    unfinished one.
+    """
+    games = args.environment_evaluation_episodes if number else math.inf
+    seeds = np.random.SeedSequence([args.seed, number + 1]).spawn(2)  # [seed, 0] is training's
+    exploration_rng, no_op_rng = [np.random.default_rng(seed) for seed in seeds]
+    env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
+    state, _ = env.reset(seed=args.seed + number)
+    finished = []
+    epsilon = args.agent_epsilon_greedy_epsilon_evaluation
+    name = "evaluation" if number else "final test"
+    for _ in tqdm(range(args.environment_test_frames), name, leave=False, mininterval=1):
+        action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
+        state, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            finished.append((float(info["episode"]["r"]), info["episode"]["l"]))
+            state, _ = env.reset()
+        if len(finished) == games:
+            break
+    unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
+    env.close()
+    return finished, unfinished
+
+
+# ---- report and checkpoint -----------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Counters:
+    """Everything that the loop counts."""
+
+    frames: int = 0
+    updates: int = 0
+    episodes: int = 0
+    seconds: float = 0.0  # wall-clock, without the pauses between stop and resume
+    evaluations: list[dict] = dataclasses.field(default_factory=list)  # rows of evaluations.csv
+    speeds: list[float] = dataclasses.field(default_factory=list)  # frames/s, by REPORT_INTERVAL
+
+
+def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
+    """A row of evaluations.csv: mean and (population) variance of the games' scores and lengths,
+    the columns of Tables 4 to 6; NaN without a finished game."""
+    row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
+    for i, name in enumerate(("score", "length")):
+        values = [game[i] for game in finished] or [math.nan]
+        row[f"{name}_mean"] = float(np.mean(values))
+        row[f"{name}_variance"] = float(np.var(values))
+    return row | {"seconds": round(counters.seconds, 1)}
+
+
+def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple) -> None:
+    """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
+    and how fast the first and the last tenth of the learning frames were."""
+    evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
+    tenth = math.ceil(len(counters.speeds) / 10)
+    result = summary(counters, finished) | {
+        "last_evaluations_score_mean": float(np.mean(evaluations)),
+        "unfinished_score_and_length": unfinished,
+        "frames_per_second_first_tenth": float(np.median(counters.speeds[:tenth] or [math.nan])),
+        "frames_per_second_last_tenth": float(np.median(counters.speeds[-tenth:] or [math.nan])),
+        "scores": [score for score, _ in finished],
+        "lengths": [length for _, length in finished],
+    }
+    print("\n".join(f"{name:32}{value}" for name, value in result.items()))
+    write_text(path, json.dumps(result, indent=2))
+
+
+def as_csv(rows: list[dict]) -> str:
+    """Rows under one header."""
+    lines = [rows[0].keys(), *(row.values() for row in rows)]
+    return "".join(",".join(map(str, line)) + "\n" for line in lines)
+
+
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
+    """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
+    one, never a part. Exits with one line if the disk refuses."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:  # torch.save makes a RuntimeError of an OSError
+        temporary.unlink(missing_ok=True)
+        raise SystemExit(f"error: {path} could not be written: {error}") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file."""
+    write_file(path, lambda temporary: temporary.write_text(text))
+
+
+def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
+    """The run directory, `args.resume` or a new one, and the lock on it, which ends with the
+    process. Exits with one line if it cannot be written or another process writes it."""
+    name = f"{args.env_id}__{script}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
+    lock = filelock.FileLock(run_dir / ".lock", timeout=0)
+    try:
+        run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
+        lock.acquire()
+    except (OSError, filelock.Timeout) as error:
+        raise SystemExit(f"error: {run_dir} is in use or cannot be written: {error}") from None
+    return run_dir, lock
+
+
+# ---- main ----------------------------------------------------------------------------------------
+
+
+def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -> None:
+    """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
+    # Adam's moments of dead units fade into denormal numbers, which make its step 10 times slower.
+    torch.set_flush_denormal(True)  # before the first parallel work: threads inherit it
+    torch.set_num_threads(args.threads or torch.get_num_threads())
+    args.threads = torch.get_num_threads()
+
+    # 1  Initialize the Atari 2600 simulators.
+    actions = envs.get_attr("meanings")[0]
+    x, _ = envs.reset(seed=args.seed + rank * args.num_simulators)  # (N, 84, 84) uint8
+    s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]  # N histories
+    # 2  Initialize 𝒟.
+    shape = (args.environment_state_height, args.environment_state_width)
+    replay = ReplayShare(args.agent_replay_buffer_maximum_length // ranks, shape, args.device)
+    # 3  Initialize θ.
+    torch.manual_seed(args.seed)
+    q_network = QNetwork(args.agent_history_length, *shape, len(actions))
+    initialize_orthogonal(q_network)
+    q_network.to(args.device, memory_format=torch.channels_last)
+    optimizer = make_optimizer(args, q_network)
+    # 4  θ⁻ = θ
+    target_network = copy.deepcopy(q_network).requires_grad_(False)
+    # 5-7  ε is a function of the frame; the rest is counted.
+    counters = Counters()
+    exploration_rng, minibatch_rng = rngs
+
+    parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
+    if args.resume:
+        path = Path(args.resume) / "checkpoint.pt"
+        saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in the file
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+        counters = Counters(**saved["counters"])
+    # The same θ, under a wrapper that averages the gradients of all processes in backward().
+    shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
+    if rank == 0:
+        run_dir, _lock = open_run(args, Path(__file__).stem)
+        write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
+        writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
+        print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
+
+    def save() -> None:
+        """q_network.pt, what it takes to play, and checkpoint.pt, what it takes to learn on."""
+        if not loss.isfinite():  # it never leaves the weights again
+            raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
+        writer.flush()
+        content = {"args": vars(args), "actions": actions, "frames": counters.frames,
+                   "q_network": q_network.state_dict()}
+        write_file(run_dir / "q_network.pt", lambda path: torch.save(content, path))
+        content = {name: part.state_dict() for name, part in parts.items()}
+        content["counters"] = vars(counters)
+        write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
+
+    stop = []  # signals: the loop ends with the step, or the evaluation, that it is at
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1,
+               disable=rank > 0)
+    loss = q = torch.zeros(())
+    started = time.monotonic() - counters.seconds
+    save_time = window_time = time.monotonic()
+    window_frames, stops = counters.frames, 0
+
+    # A frame is counted when its action is chosen, over all simulators of all processes. Learning
+    # starts `initial` frames from here, in whole steps. After n frames there have been
+    # (n - start) // agent_update_frequency updates, and those before the run was resumed.
+    step = args.num_simulators * ranks
+    start = counters.frames + math.ceil(args.agent_replay_buffer_initial / step) * step
+    updates_before = counters.updates
+
+    # 8, 30  while total_frames < number of frames to train
+    while counters.frames < args.environment_train_frames_max and not stops:
+        counters.frames += step
+
+        # 9-12  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
+        epsilon = epsilon_at(counters.frames - step, args)
+        states = replay.decode(frame for history in s for frame in history)  # (4 N, 84, 84)
+        states = states.unflatten(0, (len(s), -1))  # (N, 4, 84, 84)
+        a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
+        envs.step_async(a)
+
+        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while the simulators step.
+        due = max(0, counters.frames - start) // args.agent_update_frequency
+        for _ in range(updates_before + due - counters.updates):
+            batch_size = args.optimizer_minibatch_size // ranks
+            minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
+            loss, q = update(shared_network, target_network, optimizer, minibatch,
+                             args.agent_discount_factor, args.precision)
+            counters.updates += 1
+
+        # 24-26  θ⁻ = θ
+        interval = args.optimizer_q_network_parameter_update_interval_frames
+        if passed(counters.frames, step, interval):
+            target_network.load_state_dict(q_network.state_dict())
+
+        # 13-17  Add (s, a, r, s') to 𝒟. A simulator whose episode has ended has reset itself.
+        x, r, terminated, truncated, info = envs.step_wait()  # (N, 84, 84) uint8, (N,) each
+        ended = terminated | truncated
+        for i in range(args.num_simulators):
+            # Easy to get wrong: x[i] is then the next episode's first frame, not the end of s'.
+            last = info["final_obs"][i] if ended[i] else x[i]
+            s_next = (*s[i][1:], lz4.block.compress(last))
+            replay.add(s[i], a[i], r[i], s_next, terminated[i])
+            s[i] = (lz4.block.compress(x[i]),) * len(s_next) if ended[i] else s_next
+
+        # The processes agree on the number of episodes, and whether to stop.
+        sums = torch.tensor([ended.sum(), len(stop)])
+        if ranks > 1:
+            distributed.all_reduce(sums)
+        episodes, stops = sums.tolist()
+        counters.episodes += episodes
+        if rank > 0:
+            continue
+
+        games = info.get("final_info", {})
+        for i in np.flatnonzero(games.get("_episode", ())):
+            score, length = games["episode"]["r"][i], games["episode"]["l"][i]
+            writer.add_scalar("charts/episodic_return", score, counters.frames)
+            writer.add_scalar("charts/episodic_length", length, counters.frames)
+            bar.set_postfix_str(f"score {score:g}, ε {epsilon:.2f}", refresh=False)
+
+        # 27-29  Evaluate the agent.
+        if passed(counters.episodes, episodes, args.environment_evaluation_interval_episodes):
+            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            counters.evaluations.append(summary(counters, finished))
+            write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))
+            mean = counters.evaluations[-1]["score_mean"]
+            writer.add_scalar("evaluation/score_mean", mean, counters.frames)
+            tqdm.write(f"frame {counters.frames:,}, update {counters.updates:,}: score {mean}")
+
+        bar.update(step)
+        counters.seconds = time.monotonic() - started
+        if passed(counters.frames, step, REPORT_INTERVAL):
+            speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
+            scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
+                       "losses/td_loss": loss.item(), "losses/q_values": q.mean().item()}
+            for name, value in scalars.items():
+                writer.add_scalar(name, value, counters.frames)
+            if counters.frames > start:
+                counters.speeds.append(speed)
+            window_time, window_frames = time.monotonic(), counters.frames
+        late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes
+        interval = args.environment_checkpoint_interval_episodes
+        if late or passed(counters.episodes, episodes, interval):
+            save()
+            save_time = time.monotonic()
+
+    # 32  return θ
+    bar.close()
+    if rank == 0:
+        save()
+    if ranks > 1:
+        distributed.barrier()  # all is saved: torchrun ends the others when the first has ended
+        distributed.destroy_process_group()
+    if stops:
+        if rank == 0:
+            print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
+        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
+    if rank == 0:
+        finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
+        write_test(run_dir / "test.json", counters, finished, unfinished)
+
+
+def main(args: Args) -> None:
+    """One process of the run: its place among the others, its simulators, and `learn`."""
+    rank, ranks = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    if args.device == "auto":
+        args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    if args.device == "cuda":
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
+    if args.optimizer_minibatch_size % ranks:
+        raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
+    if ranks > 1:  # gloo on CPUs, NCCL on GPUs; the others wait while number 0 evaluates
+        distributed.init_process_group(timeout=datetime.timedelta(days=1))
+
+    # [seed, number] are the seeds of the evaluations.
+    seeds = np.random.SeedSequence([args.seed, 0, rank]).spawn(2 + args.num_simulators)
+    rngs = [np.random.default_rng(seed) for seed in seeds]
+    makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
+    # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead.
+    multiprocessing.set_forkserver_preload(["torch.utils.tensorboard", "gymnasium", "tyro"])
+    envs = AsyncVectorEnv(makers, context="spawn" if os.name == "nt" else "forkserver",
+                          autoreset_mode=AutoresetMode.SAME_STEP)
+    try:
+        learn(args, envs, rngs[:2], rank, ranks)
+    except (EOFError, ConnectionError) as error:
+        raise SystemExit(f"error: a simulator has died: {error!r}") from None
+    except RuntimeError as error:
+        if not isinstance(error, distributed.DistError) and "by peer" not in str(error):
+            raise
+        raise SystemExit(f"error: another process of the run has died: {error!r:.120}") from None
+    finally:
+        for process in envs.processes:
+            process.terminate()
+        envs.closed = True  # its own close() would wait for the dead
+
+
+if __name__ == "__main__":
+    sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
+    main(read_args())
