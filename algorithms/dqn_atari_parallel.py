@@ -6,39 +6,38 @@
 # ]
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
-§7.3.2): dqn_atari.py, whose simulator and whose one process are the bottleneck, made parallel.
+§7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the
+choice of the precision and the count of dead units.
 
-    simulators      step 1   step 2   step 3    a process each; they step while the network learns
-    network       a₁       a₂       a₃          one batch of states, one action for each simulator
-    updates         those due while the simulators step
-    processes       θ is the same in all: after each update's backward pass its gradient is averaged
+    simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
+    network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
+                                                          the simulators step
+    processes of torchrun have N simulators and a part of 𝒟 each; θ is the same in all: the
+    gradient of an update is the mean of theirs. Number 0 evaluates, logs and writes, the others
+    wait. Every number of Table 3 is a total over the processes.
 
 Run it
     python algorithms/dqn_atari_parallel.py --num-simulators 8 --agent-update-frequency 4
     python algorithms/dqn_atari_parallel.py --resume runs/RUN
-    torchrun --nproc-per-node 2 algorithms/dqn_atari_parallel.py      # 2 processes, or 2 GPUs
+    torchrun --nproc-per-node 2 algorithms/dqn_atari_parallel.py    # 2 processes; 2 GPUs
     torchrun --nnodes 2 --nproc-per-node 2 --rdzv-backend c10d --rdzv-id 1 \
-        --rdzv-endpoint FIRST_MACHINE:29400 algorithms/dqn_atari_parallel.py   # on both machines
+        --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
 Measured: see README
 
-Deviations
+Deviations, beside those of dqn_atari.py
     Algorithm 6                           this file                           why
     ------------------------------------  ----------------------------------  --------------------
-    a frame, then its update              updates due while the frames of a   both at once; Q-learn-
-                                          step are made do not see them yet   ing is off-policy
-    counts go up by 1                     by a step of all simulators of all  they step together
-                                          processes; what falls due within a
-                                          step is done once, at the step
-    ℬ ⊆ 𝒟                                 every process draws its share of    the update learns from
-                                          ℬ from its own part of 𝒟            as many transitions
-    Σ_j over ℬ (line 22)                  divided by the processes            Adam does not mind;
-                                                                              RMSprop does a little
-    Every number of Table 3 is a total over the processes; --num-simulators is for each of them.
-    A run that is resumed has its networks, optimizer and counts again. Its replay memory is filled
-    anew, up to the initial size, before it learns on. dqn_atari.py's own are exact.
-    Whoever resumes on several machines needs runs/ on all of them. The other deviations are those
-    of dqn_atari.py.
+    an update follows its frame           updates sample 𝒟 without the        emulation and learn-
+                                          frames that are under way           ing at the same time
+    counts go up by 1                     by N × processes; ε, copies and     simulators step
+                                          evaluations at the next step        together
+    ℬ ⊆ 𝒟                                 each process draws its share of ℬ   no transition travels
+                                          from its part of 𝒟
+    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam does not mind;
+                                                                              RMSProp learns slower
+    A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
+    acts until that holds the initial number, then learns on. On several machines all need runs/.
 """
 
 import copy
