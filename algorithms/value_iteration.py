@@ -223,13 +223,15 @@ def save_figure(path: Path, P, policy, V, grid: tuple, curve: list[float], label
     left.set(xlabel="iteration", ylabel=label, yscale="log" if min(curve) >= 0 else "linear")
     if len(grid) == 2 and np.prod(grid) == len(V):
         place = np.stack(np.divmod(np.arange(len(V)), grid[1])[::-1], axis=1)  # (S, 2) x, y
-        step = (P @ place).reshape(len(V), -1, 2) - place[:, None]  # (S, A, 2)
-        # An action's arrow is its mean step over the inner states: slips and walls cancel out.
-        arrow = np.clip(step, -1, 1).mean(axis=0)  # (A, 2)
+        step = P @ place - P.sum(axis=1)[:, None] * np.repeat(place, P.shape[0] // len(V), axis=0)
+        # An action's arrow is its mean step over the states: slips cancel out.
+        arrow = np.clip(step, -1, 1).reshape(len(V), -1, 2).mean(axis=0)  # (A, 2)
         acts = P.sum(axis=1)[policy] > 0  # (S,) no hole, no goal
         image = right.imshow(np.where(acts, V, np.nan).reshape(grid))
         figure.colorbar(image, label="V(s)", shrink=0.8)
-        right.quiver(*place[acts].T, *arrow[policy[acts] % len(arrow)].T, angles="xy", color="w")
+        u, v = arrow[policy[acts] % len(arrow)].T  # (cells,) each
+        longest = 2 * np.abs(arrow).max()
+        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=longest)
         right.set(title="V and π")
     figure.savefig(path, format="png", dpi=120)
 

@@ -1,89 +1,97 @@
-"""dqn_atari.py: what silently breaks in DQN code, each against an oracle that shares nothing with the script."""
+"""dqn_atari.py: what silently breaks in DQN code, each against an oracle that shares nothing with
+the script."""
 
 import copy
 import csv
 import dataclasses
-import itertools
 import json
 import math
-import re
+import os
+import subprocess
 import sys
-from collections import OrderedDict
+from pathlib import Path
+from types import SimpleNamespace
 
 import ale_py
 import dqn_atari as dqn
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers import TimeLimit
+from conftest import ALGORITHMS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-PONG, BREAKOUT = "PongNoFrameskip-v4", "BreakoutNoFrameskip-v4"
-CPU = torch.device("cpu")
-SHORT = dict(device="cpu", env_id=BREAKOUT, environment_train_frames_max=400, agent_replay_buffer_initial=100,
-             optimizer_minibatch_size=8, agent_update_frequency=4, environment_test_frames=200)  # a run of two seconds
-
-# Table 3 of the lecture, in its order
+BREAKOUT, INVADERS = "BreakoutNoFrameskip-v4", "SpaceInvadersNoFrameskip-v4"
+SHORT = dict(  # a run of a second, with a small network
+    env_id=BREAKOUT, environment_train_frames_max=400, agent_replay_buffer_initial=100,
+    agent_update_frequency=4, optimizer_minibatch_size=8, threads=1, precision="float32",
+    environment_test_frames=200, environment_state_height=44, environment_state_width=52,
+)
 TABLE_3 = """
-environment_train_frames_max 10000000
-environment_evaluation_episodes 10
-environment_evaluation_interval_episodes 500
-environment_checkpoint_interval_episodes 500
-environment_no_op_max 30
-environment_reward_clip_limit 1.0
-environment_frames_to_maxpool 2
-environment_state_height 84
-environment_state_width 84
-agent_history_length 4
-agent_action_repeat 4
-agent_update_frequency 1
-agent_discount_factor 0.99
-agent_epsilon_greedy_epsilon_initial 1.0
-agent_epsilon_greedy_epsilon_final 0.01
-agent_epsilon_greedy_annealing 1000000
-agent_epsilon_greedy_epsilon_evaluation 0.05
-agent_replay_buffer_initial 100000
-agent_replay_buffer_maximum_length 1000000
-optimizer_name Adam
-optimizer_minibatch_size 32
-optimizer_q_network_parameter_update_interval_frames 1000
-optimizer_learning_rate 0.0001
+environment_train_frames_max 10000000  environment_evaluation_episodes 10
+environment_evaluation_interval_episodes 500  environment_checkpoint_interval_episodes 500
+environment_no_op_max 30  environment_reward_clip_limit 1.0  environment_frames_to_maxpool 2
+environment_state_height 84  environment_state_width 84  agent_history_length 4
+agent_action_repeat 4  agent_update_frequency 1  agent_discount_factor 0.99
+agent_epsilon_greedy_epsilon_initial 1.0  agent_epsilon_greedy_epsilon_final 0.01
+agent_epsilon_greedy_annealing 1000000  agent_epsilon_greedy_epsilon_evaluation 0.05
+agent_replay_buffer_initial 100000  agent_replay_buffer_maximum_length 1000000
+optimizer_name Adam  optimizer_minibatch_size 32
+optimizer_q_network_parameter_update_interval_frames 1000  optimizer_learning_rate 0.0001
 """
+
+
+def decode(state: tuple) -> torch.Tensor:
+    return dqn.ReplayMemory(1, (84, 84), "cpu").decode(state)
+
+
+def environment(training: bool, env_id: str = BREAKOUT, seed: int = 7, **flags) -> gym.Env:
+    args = dqn.Args(env_id=env_id, **flags)
+    env = dqn.make_env(args, np.random.default_rng(seed), training)
+    return dqn.FrameHistory(env, args.agent_history_length)
+
+
+@pytest.fixture
+def games_of_800(monkeypatch):
+    """Games are cut off after 800 emulator frames, not 108,000."""
+    make, cap = gym.make, {"max_num_frames_per_episode": 800}
+    monkeypatch.setattr(gym, "make", lambda env_id, **flags: make(env_id, **flags | cap))
 
 
 @pytest.fixture
 def train(tmp_path, monkeypatch):
-    """Run main() in this process; returns the run directory, the replay memory and one record per update."""
+    """Run main in this process; returns the run directory, the replay memory, one record for each
+    update, and the frames at which θ was copied to the target network."""
 
     def run(**flags):
-        memories, updates = [], []
-        make_memory, original_update = dqn.ReplayMemory, dqn.update
+        memories, updates, copies = [], [], []
+        make, update, load = dqn.ReplayMemory, dqn.update, dqn.QNetwork.load_state_dict
 
-        def remember(*arguments):
-            memories.append(make_memory(*arguments))
-            return memories[-1]
-
-        def spy(q_network, working_network, target_network, *rest):
-            result = original_update(q_network, working_network, target_network, *rest)
-            updates.append({"added": memories[-1].added, "target": target_network.head.weight.clone(),
-                            "online": q_network.head.weight.detach().clone()})
+        def seen(q_network, target_network, *rest):
+            record = SimpleNamespace(frame=memories[0].added, network=q_network,
+                                     target=target_network.head.weight.clone(),
+                                     before=None if updates else copy.deepcopy(q_network))
+            result = update(q_network, target_network, *rest)
+            record.after = q_network.head.weight.detach().clone()
+            updates.append(record)
             return result
 
+        runs = tmp_path / f"runs{len(list(tmp_path.iterdir()))}"
         with monkeypatch.context() as patch:
-            patch.setattr(dqn, "ReplayMemory", remember)
-            patch.setattr(dqn, "update", spy)
-            patch.setattr(sys, "argv", ["dqn_atari.py"])
-            before = set(tmp_path.glob("*/*"))
-            runs_dir = tmp_path / f"runs{len(before)}"
-            dqn.main(dqn.Args(**(SHORT | {"runs_dir": str(runs_dir)} | flags)))
-        (run_dir,) = runs_dir.iterdir()
-        return run_dir, memories[0], updates
+            patch.setattr(dqn, "ReplayMemory", lambda *a: memories.append(make(*a)) or memories[-1])
+            patch.setattr(dqn, "update", seen)
+            patch.setattr(dqn.QNetwork, "load_state_dict", lambda network, θ: (
+                copies.append(memories[0].added), load(network, θ)))
+            dqn.main(dqn.Args(**SHORT | flags, runs_dir=str(runs)))
+        (run_dir,) = runs.iterdir()
+        return run_dir, memories[0], updates, copies
 
-    return run
+    yield run
+    torch.set_flush_denormal(False)
 
 
-def weights(run_dir) -> dict[str, torch.Tensor]:
+def weights(run_dir: Path) -> dict[str, torch.Tensor]:
     return torch.load(run_dir / "q_network.pt", weights_only=True)["q_network"]
 
 
@@ -91,327 +99,273 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
-def environment(training: bool, env_id: str = BREAKOUT, encoding: str = "lz4", cap: int | None = None, **flags):
-    """A preprocessed game, its decoder and its arguments; `cap` cuts games off after so many emulator frames."""
-    args = dqn.Args(env_id=env_id, **flags)
-    encode, decode = dqn.frame_encoding(encoding, args.environment_state_height, args.environment_state_width, CPU)
-    emulator = dqn.make_emulator(env_id)
-    if cap:
-        emulator = TimeLimit(emulator, cap)
-    return dqn.preprocess(emulator, args, encode, np.random.default_rng(7), training), decode, args
+DRIVER = """
+import dqn_atari as dqn, torch
+update = dqn.update
+def seen(*arguments):  # a million numbers: each of two threads has its share
+    assert not torch.full((1_000_000,), 1e-39).mul(0.5).any(), "denormal numbers are not flushed"
+    return update(*arguments)
+dqn.update, dqn.REPORT_INTERVAL = seen, 350
+dqn.main(dqn.read_args())
+"""
 
 
-# ---- the whole script ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("env_id", [PONG, "ALE/Breakout-v5"])
-def test_a_short_run_leaves_every_file(command_line, tmp_path, env_id):
-    done = command_line("dqn_atari.py", "--env-id", env_id, "--environment-train-frames-max", 1100,
-                        "--agent-replay-buffer-initial", 1000, "--agent-update-frequency", 4,
-                        "--environment-test-frames", 1600,
-                        "--environment-evaluation-interval-episodes", 1, "--environment-evaluation-episodes", 1,
-                        "--agent-epsilon-greedy-epsilon-evaluation", 1)
-    assert done.returncode == 0, done.stderr
-    assert not re.search("warn|Traceback|A.L.E", done.stderr, re.IGNORECASE), done.stderr
+def test_a_run_leaves_every_file_and_flushes_denormals(tmp_path):
+    flags = {"env-id": "ALE/Breakout-v5", "environment-train-frames-max": 700, "threads": 2,
+             "agent-replay-buffer-initial": 680, "agent-update-frequency": 4,
+             "environment-evaluation-interval-episodes": 6, "environment-evaluation-episodes": 1,
+             "environment-test-frames": 900, "agent-epsilon-greedy-epsilon-evaluation": 1,
+             "precision": "float32"}
+    argv = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
+    done = subprocess.run([sys.executable, "-c", DRIVER, *argv], cwd=tmp_path, timeout=120,
+                          env=os.environ | {"PYTHONPATH": str(ALGORITHMS)}, capture_output=True)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode()
     (run_dir,) = (tmp_path / "runs").iterdir()
-    assert re.fullmatch(rf"{env_id.replace('/', '-')}__dqn_atari__1__\d{{8}}-\d{{6}}", run_dir.name)
-
-    assert json.loads((run_dir / "args.json").read_text())["env_id"] == env_id
-    rows = list(csv.DictReader((run_dir / "evaluations.csv").open()))
-    assert ",".join(rows[0]) == "frames,updates,episodes,score_mean,score_variance,length_mean,length_variance,seconds"
-    assert int(rows[0]["frames"]) < 1100
+    rows = list(csv.DictReader((run_dir / "evaluations.csv").read_text().splitlines()))
+    assert ",".join(rows[0]) == ("frames,updates,episodes,score_mean,score_variance,length_mean,"
+                                 "length_variance,seconds")
+    assert [int(row["episodes"]) for row in rows] == list(range(6, 6 * len(rows) + 1, 6))
     test = json.loads((run_dir / "test.json").read_text())
-    assert test.keys() >= {*rows[0], "scores", "lengths", "seed", "env_id", "versions", "device", "peak_memory_bytes"}
-    assert (test["frames"], test["updates"]) == (1100, 26)  # frames 1000, 1004, …, 1100
-    assert sum(test["lengths"]) <= 1600
-    assert test["score_mean"] == pytest.approx(sum(test["scores"]) / len(test["scores"]))
-    assert test["length_variance"] == pytest.approx(
-        sum(n * n for n in test["lengths"]) / len(test["lengths"]) - test["length_mean"] ** 2)
-    assert f"{test['score_mean']:.5g}" in done.stdout  # the row of Table 5
+    assert test.keys() >= {*rows[0], "last_evaluations_score_mean", "unfinished_score_and_length",
+                           "frames_per_second_first_tenth", "frames_per_second_last_tenth"}
+    assert (test["frames"], test["updates"]) == (700, 6)  # an update at 680, 684, …, 700
+    scores, lengths = test["scores"], test["lengths"]
+    assert sum(lengths) + test["unfinished_score_and_length"][1] == 900 and len(scores) > 1
+    assert test["score_mean"] == pytest.approx(sum(scores) / len(scores))
+    last = [float(row["score_mean"]) for row in rows[-5:]]
+    assert test["last_evaluations_score_mean"] == pytest.approx(sum(last) / len(last))
     saved = torch.load(run_dir / "q_network.pt", weights_only=True)
     assert saved["actions"] == ["NOOP", "FIRE", "RIGHT", "LEFT"]
-    assert same(saved["q_network"], torch.load(run_dir / "checkpoint.pt", weights_only=True)["q_network"])
-
+    assert same(weights(run_dir), torch.load(run_dir / "checkpoint.pt")["q_network"])
     events = EventAccumulator(str(run_dir)).Reload()
-    layers = ("conv1", "conv2", "conv3", "linear")
-    assert set(events.Tags()["scalars"]) == {
-        "charts/episodic_return", "charts/episodic_length", "charts/epsilon", "charts/frames_per_second",
-        "losses/huber", "losses/q_values", "evaluation/score_mean", "evaluation/score_variance",
-        "evaluation/length_mean",
-        "diagnostics/q_spread", *(f"diagnostics/dead_units_{layer}" for layer in layers)}
-    assert "hyperparameters/text_summary" in events.Tags()["tensors"]
+    tags = {"charts/episodic_return", "charts/episodic_length", "charts/SPS"}
+    assert tags <= set(events.Tags()["scalars"])
+    games = [event.value for event in events.Scalars("charts/episodic_length")]
+    assert 1 <= len(games) <= 6 and sum(games) <= 700  # games, of about 180 frames, not lives
 
 
-def test_training_leaves_raw_scores_of_whole_games(train):
-    run_dir, memory, _ = train()
-    events = EventAccumulator(str(run_dir)).Reload()
-    lengths = [event.value for event in events.Scalars("charts/episodic_length")]
-    assert sum(lengths) <= 400
-    assert memory.terminals[: len(memory)].sum() >= 5 * len(lengths) >= 5  # Breakout's five lives
-
-
-# ---- Table 3, ε, counts ----------------------------------------------------------------------------
+def test_same_seed_same_run_and_an_evaluation_disturbs_nothing(train):
+    plain, memory, *_ = train()
+    evaluated, memory_2, *_ = train(environment_evaluation_interval_episodes=2,
+                                    environment_evaluation_episodes=1)
+    other, memory_3, *_ = train(seed=2)
+    assert (evaluated / "evaluations.csv").exists()
+    assert same(weights(plain), weights(evaluated)) and memory.frames == memory_2.frames
+    assert not same(weights(plain), weights(other)) and memory.frames != memory_3.frames
+    tests = [json.loads((run_dir / "test.json").read_text()) for run_dir in (plain, evaluated)]
+    assert tests[0]["unfinished_score_and_length"] == tests[1]["unfinished_score_and_length"]
 
 
 def test_first_flags_are_table_3():
-    table = [line.split() for line in TABLE_3.split("\n") if line]
-    fields = dataclasses.fields(dqn.Args)[: len(table)]
-    assert [[field.name, str(field.default)] for field in fields] == table
+    fields = dataclasses.fields(dqn.Args)
+    assert [text for field in fields[:23] for text in (field.name, str(field.default))] == (
+        TABLE_3.split())
+    own = {field.name for field in fields[23:]}
+    assert own == {"env_id", "seed", "environment_test_frames", "device", "precision", "threads",
+                   "checkpoint_interval_minutes", "resume", "runs_dir"}
 
 
-def test_epsilon():
-    args = dqn.Args()
-    for frame, epsilon in ((0, 1.0), (100_000, 0.901), (500_000, 0.505), (1_000_000, 0.01), (2_000_000, 0.01)):
-        assert dqn.epsilon_at(frame, args) == pytest.approx(epsilon, abs=1e-12)
+@pytest.mark.parametrize("frame, epsilon", [(0, 1.0), (100_000, 0.901), (500_000, 0.505),
+                                            (1_000_000, 0.01), (5_000_000, 0.01)])
+def test_epsilon(frame, epsilon):
+    assert dqn.epsilon_at(frame, dqn.Args()) == pytest.approx(epsilon, abs=1e-12)
 
 
-def test_counts_of_updates_and_target_copies(train):
-    _, _, updates = train(optimizer_q_network_parameter_update_interval_frames=150)
-    # transitions 100, 104, …, 400; nothing learns before the replay memory holds agent_replay_buffer_initial
-    assert [update["added"] for update in updates] == list(range(100, 401, 4))
-    copies = [after["added"] for before, after in itertools.pairwise(updates)
-              if not torch.equal(before["target"], after["target"])]
-    assert copies == [152, 304]  # the first updates after the copies at frames 150 and 300
-    assert torch.equal(updates[13]["target"], updates[12]["online"])  # copied at 150: what the update at 148 left
+@pytest.mark.parametrize("frequency", [1, 4])
+def test_counts_of_updates_and_target_copies_and_the_first_weights(train, frequency):
+    _, _, updates, copies = train(environment_train_frames_max=200,
+                                  agent_update_frequency=frequency,
+                                  optimizer_q_network_parameter_update_interval_frames=50)
+    assert [update.frame for update in updates] == list(range(100, 201, frequency))
+    assert copies == [50, 100, 150, 200]
+    first = updates[0].before
+    for update in updates:  # the target is what the last update before the copy left
+        left = [past.after for past in updates if past.frame <= (update.frame - 1) // 50 * 50]
+        assert torch.equal(update.target, left[-1] if left else first.head.weight)
+    for i in (0, 2, 4):
+        for weight in (first.layers[i].weight, updates[0].network.layers[i].weight):
+            assert weight.is_contiguous(memory_format=torch.channels_last)
+        filters = first.layers[i].weight.detach().flatten(1)
+        assert torch.allclose(filters @ filters.T, torch.eye(len(filters)), atol=1e-5)
 
 
-def test_same_seed_same_run_and_evaluation_leaves_training_untouched(train):
-    plain, memory, _ = train()
-    evaluated, memory_2, _ = train(environment_evaluation_interval_episodes=2, environment_evaluation_episodes=1,
-                                   agent_epsilon_greedy_epsilon_evaluation=0.5)
-    other, memory_3, _ = train(seed=2)
-    assert (evaluated / "evaluations.csv").exists()
-    assert same(weights(plain), weights(evaluated))
-    assert memory.frames == memory_2.frames
-    assert not same(weights(plain), weights(other))
-    assert memory.frames != memory_3.frames
-    tests = [json.loads((run_dir / "test.json").read_text()) for run_dir in (plain, evaluated)]
-    assert tests[0]["scores"] == tests[1]["scores"]
+def interpolation(new: int, old: int) -> np.ndarray:
+    """Bilinear weights (new, old) of a row's old pixels, pixel centres at halves."""
+    matrix = np.zeros((new, old))
+    for i in range(new):
+        place = min(max((i + 0.5) * old / new - 0.5, 0), old - 1)
+        low = min(int(place), old - 2)
+        matrix[i, low : low + 2] = low + 1 - place, place - low
+    return matrix
 
 
-@pytest.mark.parametrize("encoding", ["raw", "tensor"])
-def test_every_encoding_gives_the_same_run(train, encoding):
-    assert same(weights(train()[0]), weights(train(replay_encoding=encoding)[0]))
+def naive_frame(screens: list[np.ndarray]) -> np.ndarray:
+    """Maximum of the last two by colour, luminance, bilinear 84×84."""
+    grey = np.max(screens[-2:], axis=0) @ (0.299, 0.587, 0.114)
+    return interpolation(84, 210) @ grey @ interpolation(84, 160).T
 
 
-# ---- the environment -------------------------------------------------------------------------------
-
-
-def naive_screen(screens: list[np.ndarray], height: int, width: int) -> np.ndarray:
-    """Max per colour of the last two, luminance, bilinear with pixel centres at halves: loops over output pixels."""
-    colour = np.maximum(screens[-1], screens[-2]).astype(float) if len(screens) > 1 else screens[-1].astype(float)
-    grey = colour @ (0.299, 0.587, 0.114)
-    frame = np.empty((height, width))
-    for y in range(height):
-        for x in range(width):
-            v = min(max((y + 0.5) * grey.shape[0] / height - 0.5, 0), grey.shape[0] - 1)
-            h = min(max((x + 0.5) * grey.shape[1] / width - 0.5, 0), grey.shape[1] - 1)
-            i, j = int(v), int(h)
-            i_next, j_next = min(i + 1, grey.shape[0] - 1), min(j + 1, grey.shape[1] - 1)
-            frame[y, x] = ((1 - v + i) * (1 - h + j) * grey[i, j] + (1 - v + i) * (h - j) * grey[i, j_next]
-                           + (v - i) * (1 - h + j) * grey[i_next, j] + (v - i) * (h - j) * grey[i_next, j_next])
-    return frame
-
-
-@pytest.mark.parametrize("env_id", ["SpaceInvadersNoFrameskip-v4", BREAKOUT])
-def test_preprocessing_equals_a_computation_from_raw_screens(env_id):
-    env, decode, args = environment(training=False, env_id=env_id)
-    ale = ale_py.ALEInterface()
-    state, _ = env.reset(seed=5)
+@pytest.mark.parametrize("env_id", [INVADERS, "ALE/Breakout-v5"])
+def test_a_game_against_the_bare_emulator(env_id):
+    """Training and evaluation play the same game by the same actions, and so does the emulator."""
+    train, test, ale = environment(True, env_id), environment(False, env_id), ale_py.ALEInterface()
+    state, _ = train.reset(seed=5)
+    test_state, _ = test.reset(seed=5)
     ale.setFloat("repeat_action_probability", 0.0)
-    ale.loadROM(ale_py.roms.get_rom_path(env.unwrapped._game))
-    for _ in range(int(np.random.default_rng(7).integers(31))):
+    ale.loadROM(ale_py.roms.get_rom_path(train.unwrapped._game))
+    for _ in range(train.unwrapped.ale.getEpisodeFrameNumber()):
         ale.act(ale_py.Action.NOOP)
-    screens, actions = [ale.getScreenRGB()], np.random.default_rng(0)
-    meanings = dqn.wrapper(env, dqn.JoystickActions).meanings
-    for _ in range(60):
-        newest = decode(state)[-1].numpy()
-        assert np.abs(newest - naive_screen(screens, *newest.shape)).max() < 2  # fixed-point rounding, twice
-        action = int(actions.integers(len(meanings)))
-        state, reward, *_ = env.step(action)
-        naive_reward = 0
-        for _ in range(args.agent_action_repeat):
-            naive_reward += ale.act(getattr(ale_py.Action, meanings[action]))
-            screens.append(ale.getScreenRGB())
-        assert reward == naive_reward
+    meanings, rng = train.get_wrapper_attr("meanings"), np.random.default_rng(0)
+    history, rewards, lives, lost = [naive_frame([ale.getScreenRGB()])] * 4, [], [ale.lives()], 0
+    while not ale.game_over():
+        for i in range(4):
+            assert np.abs(decode(state)[i].numpy() - history[i - 4]).max() < 1.1  # rounded twice
+        action = int(rng.integers(len(meanings)))
+        screens, raw = [], 0
+        for _ in range(4):
+            if not ale.game_over():
+                raw += ale.act(getattr(ale_py.Action, meanings[action]))
+                screens.append(ale.getScreenRGB())
+        history.append(naive_frame(screens))
+        rewards.append(raw)
+        lives.append(ale.lives())
+        state, reward, terminated, truncated, info = train.step(action)
+        test_state, test_reward, test_terminated, _, test_info = test.step(action)
+        assert test_reward == raw and reward == np.clip(raw, -1, 1)
+        assert terminated == (lives[-1] < lives[-2]) and test_terminated == ale.game_over()
+        assert not truncated and state[-1] == test_state[-1]
+        if terminated and not ale.game_over():
+            assert "episode" not in info
+            number, last = train.unwrapped.ale.getEpisodeFrameNumber(), state[-1]
+            state, _ = train.reset()
+            assert train.unwrapped.ale.getEpisodeFrameNumber() == number
+            assert state == (last,) * 4
+            history, lost = [history[-1]] * 4, lost + 1
+    assert lost == lives[0] - 1 > 1 and (max(rewards) > 1 or "Breakout" in env_id)
+    for statistics in (info["episode"], test_info["episode"]):
+        assert (statistics["r"], statistics["l"]) == (sum(rewards), len(rewards))
+    train.reset()
+    assert train.unwrapped.ale.lives() == lives[0]
+    assert train.unwrapped.ale.getEpisodeFrameNumber() <= 30
+    assert train.unwrapped.ale.getInt("max_num_frames_per_episode") == 108_000
 
 
 def test_actions_are_four_directions_and_fire_when_centred():
-    assert dqn.wrapper(environment(False, "RiverraidNoFrameskip-v4")[0], dqn.JoystickActions).meanings == [
-        "NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN"]
-    env = environment(False, "EnduroNoFrameskip-v4")[0]
-    joystick = dqn.wrapper(env, dqn.JoystickActions)
-    assert joystick.meanings == ["NOOP", "FIRE", "RIGHT", "LEFT", "DOWN"]
-    assert [env.unwrapped.get_action_meanings()[joystick.action(i)] for i in range(5)] == joystick.meanings
+    env = environment(False, "ALE/Riverraid-v5")
+    meanings = env.get_wrapper_attr("meanings")
+    assert meanings == ["NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN"]
+    enduro = environment(False, "EnduroNoFrameskip-v4")
+    assert enduro.get_wrapper_attr("meanings") == ["NOOP", "FIRE", "RIGHT", "LEFT", "DOWN"]
+    assert enduro.action_space.n == 5
 
 
-def test_games_without_noop_or_without_directions():
-    env, _, _ = environment(False, "ALE/Backgammon-v5")  # its actions are FIRE, RIGHT, LEFT
-    bare = dqn.make_emulator("ALE/Backgammon-v5")
-    frame_numbers = []
-    for game in (env, bare):
-        game.reset(seed=1)
-        frame_numbers.append(game.unwrapped.ale.getEpisodeFrameNumber())
-    assert frame_numbers[0] == frame_numbers[1]  # nothing was pressed
-    with pytest.raises(ValueError, match="ALE/VideoCheckers-v5 cannot be played"):
-        environment(False, "ALE/VideoCheckers-v5")
+def test_no_ops_are_0_to_30_from_the_seed():
+    def numbers(count: int, seed: int, **flags) -> list[int]:
+        env = environment(False, seed=seed, **flags)
+        ale = env.unwrapped.ale
+        return [(env.reset(), ale.getEpisodeFrameNumber())[1] for _ in range(count)]
+
+    first = numbers(150, 1)
+    assert (min(first), max(first), len(set(first)) > 25) == (0, 30, True)
+    assert first[:9] == numbers(9, 1) != numbers(9, 2)
+    assert set(numbers(9, 1, environment_no_op_max=0)) == {0}
 
 
-def test_a_lost_life_neither_resets_nor_steps_the_game():
-    env, _, _ = environment(training=True)
-    env.reset(seed=3)
-    ale, rng, lives = env.unwrapped.ale, np.random.default_rng(0), []
-    while len(lives) < 6:
-        state, _, terminated, truncated, info = env.step(int(rng.integers(4)))
-        if terminated or truncated:
-            frame_number = ale.getEpisodeFrameNumber()
-            lives.append(ale.lives())
-            first, _ = env.reset()
-            if info["game_over"]:
-                assert ale.getEpisodeFrameNumber() <= 30 and ale.lives() == 5
-            else:
-                assert ale.getEpisodeFrameNumber() == frame_number > 30
-                assert first == (state[-1],) * 4  # the history begins with the life's last frame, four times
-    assert lives == [4, 3, 2, 1, 0, 4]
-
-
-def test_rewards_are_clipped_in_training_only():
-    rewards = {}
-    for training in (True, False):
-        env, _, _ = environment(training, "SpaceInvadersNoFrameskip-v4")
-        env.reset(seed=1)
-        rng = np.random.default_rng(1)
-        steps = [env.step(int(rng.integers(env.action_space.n))) for _ in range(150)]
-        rewards[training] = [step[1] for step in steps]
-        if training:
-            raw = [step[4]["raw_reward"] for step in steps]
-    assert max(rewards[True]) == 1.0 and max(raw) >= 5.0
-    assert raw == rewards[False]
-
-
-def test_the_emulator_is_asked_for_no_frame_skip_no_sticky_actions_and_108000_frames():
-    env = dqn.make_emulator(PONG)
-    assert env.spec.kwargs["max_num_frames_per_episode"] == 108_000
-    assert env.spec.kwargs["repeat_action_probability"] == 0.0 and env.spec.kwargs["frameskip"] == 1
-
-
-# ---- the replay memory -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("encoding", ["lz4", "raw", "tensor"])
-def test_replay_returns_what_was_acted_on(encoding):
-    """Across lost lives, game ends, truncation and overflow, on a real game, against a list of arrays."""
-    env, decode, _ = environment(training=True, encoding=encoding, cap=800)
-    memory, rng, naive, seen = dqn.ReplayMemory(300, decode), np.random.default_rng(0), [], set()
+def test_replay_returns_what_was_acted_on(games_of_800):
+    """Across lost lives, ends of games, truncation and overflow, against a list of arrays."""
+    env, memory = environment(training=True), dqn.ReplayMemory(300, (84, 84), "cpu")
+    rng, naive, seen, sizes = np.random.default_rng(0), [], set(), {}
     state, _ = env.reset(seed=1)
-    history = [decode(state)[-1].numpy()] * 4
-    for _ in range(2000):
-        acted_on = decode(state).numpy()
-        assert acted_on.tobytes() == np.stack(history[-4:]).tobytes()
-        action = int(rng.integers(env.action_space.n))
-        next_state, reward, terminated, truncated, info = env.step(action)
-        memory.add(state, action, reward, next_state, terminated)
-        history.append(decode(next_state)[-1].numpy())
-        naive.append((acted_on, action, reward, np.stack(history[-4:]), terminated))
-        state = next_state
+    for n in range(1, 1301):
+        action = int(rng.integers(4))
+        s = decode(state)
+        state_next, reward, terminated, truncated, info = env.step(action)
+        memory.add(state, action, reward, state_next, terminated)
+        naive.append((s, action, reward, decode(state_next), terminated))
+        sizes |= {id(x): sys.getsizeof(x) for x in (*state, *state_next)} if n <= 250 else {}
+        state = state_next
         if terminated or truncated:
-            seen.add("truncation" if truncated else "game over" if info["game_over"] else "lost life")
+            assert not (terminated and truncated)
+            seen.add("cut" if truncated else "game over" if "episode" in info else "life lost")
             state, _ = env.reset()
-            history = [decode(state)[-1].numpy()] * 4
-    assert seen == {"truncation", "game over", "lost life"}
-    assert len(memory) == 300
-    for i, (s, a, r, s_next, terminal) in zip(range(1700, 2000), naive[-300:], strict=True):
-        got = memory.gather(np.array([i % 300]))
-        for expected, tensor in zip((s, a, r, s_next, terminal), got, strict=True):
-            assert np.array_equal(expected, tensor[0].numpy())
+        if n == 250:
+            assert len(memory) == 250
+            size = sum(sizes.values()) + sum(map(sys.getsizeof, memory.frames[:250]))
+            assert size / 250 + memory.numbers[0].nbytes < 1500
+        if n in (250, 300, 301, 650, 1300):
+            copied = dqn.ReplayMemory(300, (84, 84), "cpu")
+            saved = memory.state_dict()
+            copied.load_state_dict(saved)
+            frames = {id(x) for stored in memory.frames for x in stored}
+            assert len(saved["lengths"]) == len(frames) == len(
+                {id(x) for stored in copied.frames for x in stored})
+            kept, places = naive[-300:], np.arange(max(n - 300, 0), n) % 300
+            for replay in (memory, copied):
+                got = replay.gather(places)
+                dtypes = [torch.uint8, torch.int64, torch.float32, torch.uint8, torch.bool]
+                assert [column.dtype for column in got] == dtypes
+                for column, expected in zip(got, zip(*kept, strict=True), strict=True):
+                    expected = torch.stack([torch.as_tensor(value) for value in expected])
+                    assert torch.equal(column, expected.to(column.dtype))
+    assert seen == {"cut", "game over", "life lost"}
 
 
-def test_minibatches_are_uniform_with_replacement():
-    encode, decode = dqn.frame_encoding("lz4", 2, 2, CPU)
-    memory = dqn.ReplayMemory(4, decode)
-    for i in range(6):  # 0 and 1 are overwritten
-        code = encode(np.full((2, 2), i, np.uint8))
-        memory.add((code,) * 4, i, 0.0, (code,) * 4, False)
-    s, a, r, s_next, terminal = memory.sample(4000, np.random.default_rng(0))
-    assert (s.shape, s.dtype) == ((4000, 4, 2, 2), torch.uint8) and s_next.shape == s.shape
-    assert (a.dtype, r.dtype, terminal.dtype) == (torch.int64, torch.float32, torch.bool)
-    assert torch.equal(s[:, 0, 0, 0].long(), a)
-    counts = np.bincount(a.numpy(), minlength=6)
-    assert list(counts[:2]) == [0, 0]
-    assert all(abs(count - 1000) < 5 * math.sqrt(4000 * 0.25 * 0.75) for count in counts[2:])
+def test_in_a_run_truncation_bootstraps_and_a_lost_life_does_not(train, games_of_800):
+    _, memory, _, _ = train(environment_train_frames_max=650, environment_no_op_max=0)
+    frames, terminal = memory.frames, memory.numbers[:, 2]
+    ends = [i - 1 for i in range(1, 650) if len({id(x) for x in frames[i][:4]}) == 1]
+    cut = [i for i in ends if not terminal[i]]
+    assert 1 <= len(cut) <= 3 < terminal.sum() and set(ends) >= set(np.flatnonzero(terminal[:-1]))
 
 
-def test_truncation_bootstraps_and_a_lost_life_does_not(train, monkeypatch):
-    make = dqn.make_emulator
-    monkeypatch.setattr(dqn, "make_emulator", lambda env_id: TimeLimit(make(env_id), 400))
-    _, memory, _ = train(environment_no_op_max=0)  # cut off after 100 frames of the agent, in the second life or later
-    starts = [i for i in range(1, 400) if len({id(code) for code in memory.frames[i][:4]}) == 1]
-    ends = [i - 1 for i in starts]
-    truncated = [i for i in ends if not memory.terminals[i]]
-    assert truncated == [99, 199, 299]
-    assert memory.terminals.sum() == len(ends) - len(truncated) > 3
-
-
-def test_training_acts_in_lower_precision_and_evaluation_in_float32(train, monkeypatch):
-    act, evaluate, evaluating, seen = dqn.greedy_action, dqn.evaluate, [], {True: set(), False: set()}
-
-    def spy(network, state):
-        seen[bool(evaluating)].add(network.layers.conv1.weight.dtype)
-        return act(network, state)
-
-    def spied_evaluate(*arguments, **limit):
-        evaluating.append(True)
-        finished = evaluate(*arguments, **limit)
-        evaluating.pop()
-        return finished
-
-    monkeypatch.setattr(dqn, "greedy_action", spy)
-    monkeypatch.setattr(dqn, "evaluate", spied_evaluate)
-    train(precision="bfloat16", agent_epsilon_greedy_epsilon_initial=0.5)
-    assert seen == {True: {torch.float32}, False: {torch.bfloat16}}
-
-
-# ---- the network -----------------------------------------------------------------------------------
+def test_minibatches_are_drawn_from_all_of_the_memory(train, monkeypatch):
+    drawn, gather = [], dqn.ReplayMemory.gather
+    monkeypatch.setattr(dqn, "update", lambda *_: (torch.zeros(()), torch.zeros(8)))
+    monkeypatch.setattr(dqn.ReplayMemory, "gather",
+                        lambda self, indices: drawn.append(indices) or gather(self, indices))
+    train(agent_replay_buffer_maximum_length=100, agent_update_frequency=1)
+    counts = np.bincount(np.concatenate(drawn), minlength=100)  # 301 minibatches of 8
+    mean = 301 * 8 / 100
+    assert len(counts) == 100 and counts.min() > 0
+    assert np.square(counts - mean).sum() / mean < 99 + 5 * math.sqrt(2 * 99)  # chi-squared
+    assert sum(len(set(indices)) < 8 for indices in drawn) > 30  # with replacement: of 301, 75
 
 
 def test_network_is_table_2():
     torch.manual_seed(0)
-    network, shapes = dqn.QNetwork(4, 84, 84, num_actions=6), []
+    network, shapes, inputs = dqn.QNetwork(4, 84, 84, num_actions=6), [], []
+    before = {name: θ.clone() for name, θ in network.state_dict().items()}
     dqn.initialize_orthogonal(network)
+    changed = {name for name, θ in network.state_dict().items() if not torch.equal(θ, before[name])}
+    assert changed == {"layers.0.weight", "layers.2.weight", "layers.4.weight"}
+    for name, fan_in in (("layers.7.weight", 3136), ("layers.0.bias", 256), ("head.bias", 512)):
+        assert 0.5 < before[name].abs().max() * fan_in**0.5 <= 1  # PyTorch's default
+    network.layers[0].register_forward_pre_hook(lambda _, x: inputs.append(x[0]))
     for layer in [*network.layers, network.head]:
-        layer.register_forward_hook(lambda layer, _, output: shapes.append((
-            type(layer).__name__, tuple(output.shape[1:]), sum(p.numel() for p in layer.parameters()))))
-    q = network(torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8))
+        layer.register_forward_hook(lambda layer, _, out: shapes.append((
+            type(layer).__name__, tuple(out.shape), sum(θ.numel() for θ in layer.parameters()))))
+    pixels = torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8)
+    q = network(pixels)
     assert shapes == [
-        ("PixelConv2d", (32, 20, 20), 8224), ("ReLU", (32, 20, 20), 0),
-        ("Conv2d", (64, 9, 9), 32832), ("ReLU", (64, 9, 9), 0),
-        ("Conv2d", (64, 7, 7), 36928), ("ReLU", (64, 7, 7), 0), ("Flatten", (3136,), 0), ("Linear", (512,), 1606144),
-        ("ReLU", (512,), 0), ("Linear", (6,), 512 * 6 + 6)]
-    assert q.dtype == torch.float32
-    assert [(layer.kernel_size[0], layer.stride[0]) for layer in network.layers if isinstance(layer, nn.Conv2d)] == [
-        (8, 4), (4, 2), (3, 1)]
-    for layer in network.layers:
-        if isinstance(layer, nn.Conv2d):
-            filters = layer.weight.detach().flatten(1)
-            assert torch.allclose(filters @ filters.T, torch.eye(len(filters)), atol=1e-5)
+        ("Conv2d", (2, 32, 20, 20), 8224), ("ReLU", (2, 32, 20, 20), 0),
+        ("Conv2d", (2, 64, 9, 9), 32832), ("ReLU", (2, 64, 9, 9), 0),
+        ("Conv2d", (2, 64, 7, 7), 36928), ("ReLU", (2, 64, 7, 7), 0),
+        ("Flatten", (2, 3136), 0), ("Linear", (2, 512), 1606144), ("ReLU", (2, 512), 0),
+        ("Linear", (2, 6), 512 * 6 + 6),
+    ]
+    convolutions = [layer for layer in network.layers if isinstance(layer, nn.Conv2d)]
+    sizes = [(layer.kernel_size[0], layer.stride[0], layer.padding[0]) for layer in convolutions]
+    assert sizes == [(8, 4, 0), (4, 2, 0), (3, 1, 0)]
+    assert torch.equal(inputs[0], pixels / 255)
 
-
-def test_network_scales_its_pixels_to_0_1():
-    network, outputs = dqn.QNetwork(4, 84, 84, 2), []
-    conv1 = network.layers.conv1
-    conv1.register_forward_hook(lambda *arguments: outputs.append(arguments[-1]))
-    pixels = torch.randint(0, 256, (3, 4, 84, 84), dtype=torch.uint8)
-    network(pixels)
-    assert torch.allclose(outputs[0], nn.functional.conv2d(pixels / 255, conv1.weight, conv1.bias, stride=4), atol=1e-5)
-
-
-# ---- the update ------------------------------------------------------------------------------------
+    last = copy.deepcopy(network).to(memory_format=torch.channels_last)
+    assert torch.allclose(last(pixels), q, atol=1e-5)
 
 
 class Table(nn.Module):
     """Q(s_j, ·) of the j-th state of a minibatch is the j-th row of a table, whatever the state."""
 
-    def __init__(self, rows):
+    def __init__(self, rows: list):
         super().__init__()
         self.rows = nn.Parameter(torch.tensor(rows))
 
@@ -419,237 +373,131 @@ class Table(nn.Module):
         return self.rows[: len(states)]
 
 
-def test_update_is_the_clipped_error_of_each_sample():
-    q_table = [[0.0, 9.0], [0.5, 0.0], [7.0, 0.0], [-4.0, 1.0]]
-    target_table = [[1.0, 2.0], [3.0, 0.1], [5.0, 5.0], [2.0, 8.0]]
-    a, r, terminal = [0, 0, 1, 1], [0.5, 1.0, -1.0, 1.0], [False, True, False, True]
-    discount, expected = 0.9, [row.copy() for row in q_table]
-    for j in range(4):  # by hand: y, δ, one step of size 1 along the gradient of Σ huber(δ)
-        y = r[j] if terminal[j] else r[j] + discount * max(target_table[j])
-        expected[j][a[j]] -= min(max(q_table[j][a[j]] - y, -1.0), 1.0)
-    q_network, target_network = Table(q_table), Table(target_table)
-    states = torch.zeros((4, 4, 84, 84), dtype=torch.uint8)
-    minibatch = (states, torch.tensor(a), torch.tensor(r), states, torch.tensor(terminal))
-    optimizer = torch.optim.SGD(q_network.parameters(), lr=1.0)
-    loss, q = dqn.update(q_network, q_network, target_network, optimizer, minibatch, discount)
-    assert q.tolist() == [0.0, 0.5, 0.0, 1.0]
-    assert torch.allclose(q_network.rows, torch.tensor(expected))
-    assert target_network.rows.tolist() == Table(target_table).rows.tolist() and target_network.rows.grad is None
-    errors = [0.0 - 2.3, 0.5 - 1.0, 0.0 - 3.5, 1.0 - 1.0]
-    assert loss.item() == pytest.approx(sum(e * e / 2 if abs(e) < 1 else abs(e) - 0.5 for e in errors) / 4)
+def test_update_is_equation_37_by_hand():
+    q = Table([[1.0, 2.0], [0.0, -1.0], [3.0, 0.5], [0.0, 0.0]])
+    target = Table([[0.5, 3.0], [2.0, 4.0], [1.0, 0.0], [-1.0, -2.0]])
+    s = torch.zeros((4, 4, 84, 84), dtype=torch.uint8)
+    r, terminal = torch.tensor([1.0, 0.0, -1.0, 0.25]), torch.tensor([False, True, False, False])
+    minibatch = s, torch.tensor([0, 1, 1, 0]), r, s, terminal
+    before, sgd = q.rows.detach().clone(), torch.optim.SGD(q.parameters(), lr=0.1)
+    loss, values = dqn.update(q, target, sgd, minibatch, 0.9, "float32")
+    # y = 1 + 0.9·3, 0, -1 + 0.9·1, 0.25 - 0.9·1; Q - y = -2.7, -1, 0.6, 0.65
+    gradient = torch.tensor([[-1, 0], [0, -1], [0, 0.6], [0.65, 0]])  # clipped; of the sum
+    assert torch.allclose(q.rows.grad, gradient)
+    assert torch.allclose(q.rows, before - 0.1 * gradient)
+    assert target.rows.grad is None
+    assert loss.item() == pytest.approx((2.2 + 0.5 + 0.18 + 0.21125) / 4)
+    assert values.tolist() == [1, -1, 0.5, 0] and values.shape == (4,)
+    dqn.update(q, target, sgd, minibatch, 0.9, "float32")  # gradients start from zero
+    assert torch.allclose(q.rows.grad[:2], gradient[:2], atol=0.2)
 
 
-def test_bfloat16_updates_keep_float32_weights_and_nearly_the_same_gradient():
+def test_update_in_bfloat16_is_close_to_float32():
     torch.manual_seed(0)
-    gradients = {}
-    s, s_next = torch.randint(0, 256, (2, 32, 4, 84, 84), dtype=torch.uint8)
-    minibatch = (s, torch.randint(0, 4, (32,)), torch.randn(32), s_next, torch.zeros(32, dtype=torch.bool))
-    for precision in (torch.float32, torch.bfloat16):
-        torch.manual_seed(1)
-        q_network = dqn.QNetwork(4, 84, 84, 4)
-        before = [parameter.detach().clone() for parameter in q_network.parameters()]
-        working_network = dqn.working_copy(q_network, precision)
-        target_network = copy.deepcopy(working_network).requires_grad_(False)
-        optimizer = torch.optim.SGD(q_network.parameters(), lr=1e-3)
-        dqn.update(q_network, working_network, target_network, optimizer, minibatch, 0.99)
-        gradients[precision] = torch.cat([p.grad.flatten() for p in q_network.parameters()])
-        for old, θ, working in zip(before, q_network.parameters(), working_network.parameters(), strict=True):
-            assert θ.dtype == torch.float32
-            # steps of about 1e-5, in weights of about 0.01: bfloat16's three digits would lose them
-            assert torch.allclose(old - θ.detach(), 1e-3 * θ.grad, rtol=1e-3, atol=1e-8)
-            assert torch.equal(working, θ.to(working.dtype))
-    exact, rounded = gradients.values()
-    assert rounded.dtype == torch.float32 and not torch.equal(exact, rounded)
-    assert torch.cosine_similarity(exact, rounded, dim=0) > 0.999
+    network, rng = dqn.QNetwork(4, 84, 84, 6), torch.Generator().manual_seed(1)
+    dqn.initialize_orthogonal(network)
+    s, s_next = torch.randint(0, 256, (2, 32, 4, 84, 84), dtype=torch.uint8, generator=rng)
+    r = torch.randint(-1, 2, (32,), generator=rng).float()
+    minibatch = s, torch.arange(32) % 6, r, s_next, r < 0
+    results, dtypes = {}, []
+    for precision in ("float32", "bfloat16"):
+        q = copy.deepcopy(network)
+        q.layers[2].register_forward_hook(lambda *arguments: dtypes.append(arguments[-1].dtype))
+        sgd = torch.optim.SGD(q.parameters(), lr=1)
+        loss, values = dqn.update(q, copy.deepcopy(network), sgd, minibatch, 0.99, precision)
+        assert values.dtype == loss.dtype == torch.float32
+        assert all(θ.dtype == θ.grad.dtype == torch.float32 for θ in q.parameters())
+        results[precision] = values, torch.cat([θ.grad.flatten() for θ in q.parameters()])
+    assert dtypes == [torch.float32, torch.bfloat16]
+    (q_32, gradient_32), (q_16, gradient_16) = results.values()
+    assert torch.allclose(q_32, q_16, atol=0.02) and not torch.equal(q_32, q_16)
+    assert torch.cosine_similarity(gradient_32, gradient_16, dim=0) > 0.99
 
 
-@pytest.mark.skipif(not dqn.multiplies_bfloat16(), reason="only where the CPU multiplies bfloat16 is it used")
-def test_onednn_layout_computes_what_the_layers_do():
-    torch.manual_seed(0)
-    states = torch.randint(0, 256, (8, 4, 84, 84), dtype=torch.uint8)
-    working_network = dqn.working_copy(dqn.QNetwork(4, 84, 84, 4), torch.bfloat16)
-    plain = copy.deepcopy(working_network)
-    plain.layers = torch.nn.Sequential(OrderedDict(plain.layers.named_children()))
-    values = []
-    for network in (working_network, plain):
-        values.append(network(states))
-        values[-1].square().sum().backward()
-    assert torch.allclose(*values, rtol=0.01, atol=0.001)
-    assert working_network.state_dict().keys() == plain.state_dict().keys()
-    for mine, theirs in zip(working_network.parameters(), plain.parameters(), strict=True):
-        assert torch.cosine_similarity(mine.grad.flatten().float(), theirs.grad.flatten().float(), dim=0) > 0.999
-
-
-def test_rmsprop_against_a_trace_by_hand():
-    θ, g, n, trace = 1.0, 0.0, 0.0, []
-    for gradient in (2.0, -0.3, 0.05):
-        g, n = 0.95 * g + 0.05 * gradient, 0.95 * n + 0.05 * gradient**2
-        θ -= 0.00025 * gradient / math.sqrt(n - g * g + 0.01)
-        trace.append(θ)
-    args = dqn.Args(optimizer_name="RMSprop", optimizer_learning_rate=0.00025)
-    module = nn.Linear(1, 1, bias=False, dtype=torch.float64)
-    nn.init.ones_(module.weight)
-    optimizer = dqn.make_optimizer(args, module)
-    for gradient, expected in zip((2.0, -0.3, 0.05), trace, strict=True):
-        module.weight.grad = torch.tensor([[gradient]], dtype=torch.float64)
+def test_rmsprop_is_the_one_that_nature_released():
+    θ = torch.tensor([1.0, -2.0], requires_grad=True)
+    args = dqn.Args(optimizer_name="RMSprop", optimizer_learning_rate=0.1)
+    optimizer = dqn.make_optimizer(args, SimpleNamespace(parameters=lambda: [θ]))
+    naive, g, n = [1.0, -2.0], [0.0, 0.0], [0.0, 0.0]
+    for gradient in ([1.0, -0.5], [0.0, 3.0], [-2.0, 1e-4]):
+        θ.grad = torch.tensor(gradient)
         optimizer.step()
-        assert module.weight.item() == pytest.approx(expected, abs=1e-14)
+        for i, d in enumerate(gradient):
+            g[i] = 0.95 * g[i] + 0.05 * d
+            n[i] = 0.95 * n[i] + 0.05 * d * d
+            naive[i] -= 0.1 * d / math.sqrt(n[i] - g[i] ** 2 + 0.01)
+        assert θ.tolist() == pytest.approx(naive, rel=1e-5)
 
 
-@pytest.mark.parametrize("decays", [(0.0, 0.95), (0.95, 1.0)])
-def test_rmsprop_stays_finite_with_unequal_decays(decays):
-    module = nn.Linear(1, 1, bias=False)
-    args = dqn.Args(optimizer_name="RMSprop", optimizer_gradient_momentum=decays[0],
-                    optimizer_squared_gradient_momentum=decays[1])
-    optimizer = dqn.make_optimizer(args, module)
-    for _ in range(3):
-        module.weight.grad = torch.ones(1, 1)
-        optimizer.step()
-    assert module.weight.isfinite().all()  # n - g² is negative here
+@pytest.mark.parametrize("bfloat16, choice", [(0.5, "bfloat16"), (0.95, "float32"), (2, "float32")])
+def test_bfloat16_only_where_it_is_quicker_by_a_clear_margin(monkeypatch, bfloat16, choice):
+    seconds, seen, update = {"float32": 1.0, "bfloat16": bfloat16}, [], dqn.update
+    monkeypatch.setattr(dqn, "update", lambda *all: seen.append(all[-1]) or update(*all))
+    monkeypatch.setattr(dqn.timeit, "repeat", lambda work, **_: (work(), [seconds[seen[-1]]])[1])
+    assert dqn.choose_precision(dqn.Args(device="cpu", optimizer_minibatch_size=2)) == choice
 
 
-def test_optimizers_differ(train):
-    runs = [train(optimizer_name=name)[0] for name in ("Adam", "RMSprop")]
-    assert not same(weights(runs[0]), weights(runs[1]))
-    optimizer = torch.load(runs[1] / "checkpoint.pt", weights_only=True)["optimizer"]
-    assert optimizer["param_groups"][0]["mean_decay"] == 0.95
+class Scripted(gym.Env):
+    """Games of 5, 9, 4, 5, 9, 4, … frames, each frame worth 2 points."""
+
+    action_space, observation_space = gym.spaces.Discrete(4), gym.spaces.Box(0, 255, (84, 84))
+
+    def __init__(self):
+        self.games, self.actions = -1, []
+
+    def reset(self, **_):
+        self.games, self.left = self.games + 1, (5, 9, 4)[(self.games + 1) % 3]
+        return np.zeros((84, 84), np.uint8), {}
+
+    def step(self, action):
+        self.actions.append(action)
+        self.left -= 1
+        return np.zeros((84, 84), np.uint8), 2.0, self.left == 0, False, {}
 
 
-# ---- evaluation ------------------------------------------------------------------------------------
+@pytest.fixture
+def evaluated(monkeypatch):
+    """evaluate() of a network that likes action 2, on scripted games; its result, the actions."""
+
+    def network(states):
+        assert states.shape == (1, 4, 84, 84)
+        return torch.tensor([[0.0, 1.0, 3.0, 2.0]])
+
+    def run(number: int, games: int, frames: int) -> tuple:
+        env = Scripted()
+
+        def make_env(args, no_op_rng, training):
+            assert not training
+            return gym.wrappers.RecordEpisodeStatistics(env)
+
+        monkeypatch.setattr(dqn, "make_env", make_env)
+        args = dqn.Args(environment_evaluation_episodes=games, environment_test_frames=frames)
+        return dqn.evaluate(args, network, decode, number), env.actions
+
+    network.head = SimpleNamespace(out_features=4)
+    return run
 
 
-def evaluate(number: int, seed: int = 1, **limit) -> list[tuple[float, int]]:
-    args = dqn.Args(env_id="SpaceInvadersNoFrameskip-v4", seed=seed)
-    torch.manual_seed(0)
-    stop = type("NoStop", (), {"signum": 0})
-    return dqn.evaluate(args, dqn.QNetwork(4, 84, 84, 4), dqn.frame_encoding("lz4", 84, 84, CPU), number, stop, **limit)
+@pytest.mark.parametrize("number, games, frames, finished, unfinished", [
+    (1, 2, 1000, [(10, 5), (18, 9)], (0, 0)),  # so many games
+    (1, 9, 16, [(10, 5), (18, 9)], (4, 2)),  # a limit of frames
+    (0, 1, 24, [(10, 5), (18, 9), (8, 4), (10, 5)], (2, 1)),  # the test: what the frames hold
+])
+def test_evaluation_counts_finished_games(evaluated, number, games, frames, finished, unfinished):
+    assert evaluated(number, games, frames)[0] == (finished, unfinished)
 
 
-def test_every_purpose_has_random_numbers_of_its_own(train, monkeypatch):
-    streams, make = [], np.random.default_rng
-
-    def remember(seed):
-        streams.append(tuple(make(seed).integers(2**60, size=4)))
-        return make(seed)
-
-    monkeypatch.setattr(dqn.np.random, "default_rng", remember)
-    train(environment_evaluation_interval_episodes=4, environment_evaluation_episodes=1)
-    assert len(streams) >= 8 and len(set(streams)) == len(streams)  # training, the memory's estimate, evaluations, test
+def test_evaluation_acts_at_random_in_1_of_20_frames_and_is_reproducible(evaluated):
+    actions = evaluated(0, 10, 6000)[1]
+    share = np.bincount(actions, minlength=4) / 6000
+    assert share == pytest.approx([0.0125, 0.0125, 0.9625, 0.0125], abs=0.008)
+    assert actions == evaluated(0, 10, 6000)[1]
+    assert actions[:900] != evaluated(1, 999, 900)[1] != evaluated(2, 999, 900)[1]
 
 
-def test_evaluation_plays_whole_games_for_raw_reward():
-    games = evaluate(1, games=2)
-    assert len(games) == 2
-    assert all(length > 300 and score % 5 == 0 for score, length in games)  # three lives
-    assert max(score for score, _ in games) >= 30  # unclipped: a dozen invaders at most
-    assert evaluate(1, games=2) == games
-    assert evaluate(2, games=2) != games
-    frames = sum(length for _, length in games)
-    assert evaluate(1, frames=frames) == games
-    assert evaluate(1, frames=frames - 1) == games[:1]  # the unfinished game does not count
-
-
-# ---- what a person sees ----------------------------------------------------------------------------
-
-
-def test_a_dead_network_says_so(train, monkeypatch, capsys):
-    update = dqn.update
-
-    def kill(q_network, *rest):
-        nn.init.constant_(q_network.layers.conv3.bias, -100)
-        return update(q_network, *rest)
-
-    monkeypatch.setattr(dqn, "LOG_INTERVAL", 50)
-    monkeypatch.setattr(dqn, "update", kill)
-    train()
-    (warning,) = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]  # once, at once
-    assert "frame 104" in warning and "dead_units_conv3" in warning
-
-
-def test_dead_units_and_spread_are_counted():
-    network = dqn.QNetwork(4, 84, 84, 2)
-    nn.init.constant_(network.layers.conv2.weight[:16], 0)
-    nn.init.constant_(network.layers.conv2.bias[:16], -1)
-    states = torch.randint(0, 256, (8, 4, 84, 84), dtype=torch.uint8)
-    scalars = dqn.diagnose(network, states)
-    assert scalars["diagnostics/dead_units_conv2"] >= 16 / 64
-    assert scalars["diagnostics/dead_units_conv1"] < 0.5
-    assert scalars["diagnostics/q_spread"] == pytest.approx(network(states).std(dim=0, correction=0).mean().item())
-
-
-def test_a_nan_stops_the_run_and_names_frame_and_checkpoint(train, monkeypatch, capsys, tmp_path):
-    update = dqn.update
-
-    def poison(q_network, *rest):
-        loss, q = update(q_network, *rest)
-        nn.init.constant_(q_network.head.bias, math.nan)
-        return loss, q
-
-    monkeypatch.setattr(dqn, "update", poison)
-    with pytest.raises(SystemExit) as stopped:
-        train(environment_checkpoint_interval_episodes=1)
-    assert stopped.value.code == 1
-    (run_dir,) = tmp_path.glob("*/*")
-    error = capsys.readouterr().err
-    assert re.search(r"error: .*not finite at frame \d+", error) and str(run_dir / "checkpoint.pt") in error
-    assert all(tensor.isfinite().all() for tensor in weights(run_dir).values())  # the last one before the NaN
-
-
-BAD_FLAGS = {
-    "--env-id PongNoFrameskp-v4": "PongNoFrameskip-v4",
-    "--env-id CartPole-v1": "no Atari game",
-    "--env-id ": "unknown game",
-    "--agent-epsilon-greedy-epsilon-final 1.5": "between 0 and 1",
-    "--agent-epsilon-greedy-epsilon-initial -0.1": "between 0 and 1",
-    "--agent-epsilon-greedy-epsilon-evaluation nan": "between 0 and 1",
-    "--agent-discount-factor 2": "between 0 and 1",
-    "--optimizer-minibatch-size 0": "above 0",
-    "--optimizer-learning-rate -1": "above 0",
-    "--optimizer-learning-rate inf": "above 0",
-    "--agent-history-length 0": "above 0",
-    "--agent-action-repeat 0": "above 0",
-    "--environment-train-frames-max 0": "above 0",
-    "--environment-no-op-max -1": "at least 0",
-    "--environment-state-height 20": "at least 36",
-    "--seed -1": "at least 0",
-    "--optimizer-minibatch-size 200000": "--agent-replay-buffer-initial",
-    "--agent-replay-buffer-initial 2000000": "--agent-replay-buffer-maximum-length",
-    "--optimizer-name SGD": "'Adam'",
-    "--optimizer-minibatch-size many": "--optimizer-minibatch-size",
-    "--device cuda": "sees no such device",
-    "--no-such-flag 1": "--no-such-flag",
-    f"--agent-replay-buffer-maximum-length {10**15} --environment-train-frames-max {10**15}": "lower --agent-replay",
-    "--runs-dir occupied": "cannot be written",
-    "--resume nowhere": "no run directory",
-}
-
-
-@pytest.mark.parametrize("flags", BAD_FLAGS)
-def test_bad_input_is_one_line_and_exit_code_2(flags, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "occupied").write_text("a file where the folder should be")
-    monkeypatch.setattr(sys, "argv", ["dqn_atari.py", *flags.split(" ")])
-    with pytest.raises(SystemExit) as stopped:
-        dqn.main(dqn.parse_args(dqn.Args))
-    streams = capsys.readouterr()
-    assert stopped.value.code == 2
-    assert re.fullmatch(r"error: [^\n]+\n", streams.err) and streams.out == ""
-    assert BAD_FLAGS[flags] in streams.err
-    assert [path.name for path in tmp_path.iterdir()] == ["occupied"]
-
-
-def test_memory_that_is_not_free_is_refused_with_numbers():
-    args = dqn.Args(agent_replay_buffer_maximum_length=10**15, environment_train_frames_max=10**15)
-    with pytest.raises(ValueError, match=r"1(,000){5} transitions needs [\d.]+ GB, [\d.]+ GB are free"):
-        dqn.choose_encoding(args, CPU)
-    name, need = dqn.choose_encoding(dqn.Args(), CPU)
-    assert name == "lz4" and 0.2e9 < need < 0.8e9  # a million frames of Pong
-
-
-def test_help_names_every_flag_with_its_source(command_line):
-    done = command_line("dqn_atari.py", "--help")
-    assert done.returncode == 0
-    text = " ".join(done.stdout.split())
-    for field in dataclasses.fields(dqn.Args):
-        assert dqn.flag(field.name) in text
-    assert text.count("[Table 3") >= 23
+def test_mean_and_variance_by_hand():
+    counters = dqn.Counters(frames=3, updates=2, episodes=1, seconds=1.25)
+    row = dqn.summary(counters, [(1.0, 10), (4.0, 20), (7.0, 60)])
+    assert row == {"frames": 3, "updates": 2, "episodes": 1, "score_mean": 4, "score_variance": 6,
+                   "length_mean": 30, "length_variance": pytest.approx(1400 / 3), "seconds": 1.2}
+    assert math.isnan(dqn.summary(counters, [])["score_mean"])

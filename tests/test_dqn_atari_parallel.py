@@ -82,9 +82,9 @@ def read_checkpoint(run_dir: Path) -> dict:
 
 @pytest.mark.parametrize("simulators", [1, 3, 4])
 def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
-    run = Run(tmp_path, num_simulators=simulators, environment_train_frames_max=600 * simulators,
+    run = Run(tmp_path, num_simulators=simulators, environment_train_frames_max=400 * simulators,
               agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400)
-    s, a, r, s_next, terminal = run.memory.gather(np.arange(600 * simulators))
+    s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
     assert len({str(rng.bit_generator.state) for rng in run.no_op_rngs}) == simulators
     ends = []
     for i, rng in enumerate(run.no_op_rngs):
@@ -111,8 +111,9 @@ def test_batch_of_actions_is_greedy_for_each_state():
     wanted = [serial.epsilon_greedy(q_network, state, 0.0, rng) for state in states]
     assert parallel.epsilon_greedy_batch(q_network, states, 0.0, rng).tolist() == wanted
     many = [parallel.epsilon_greedy_batch(q_network, states, 0.6, rng) for _ in range(400)]
-    assert abs((np.array(many) == wanted).mean() - (0.4 + 0.6 / 6)) < 0.04
-    assert len(set(map(tuple, many))) > 100  # each simulator draws for itself
+    greedy = np.array(many) == wanted  # (400, 5)
+    assert abs(greedy.mean() - (0.4 + 0.6 / 6)) < 0.04
+    assert greedy.all(axis=1).mean() < 0.1  # each simulator draws for itself
 
 
 @pytest.mark.parametrize(("simulators", "frequency"), [(3, 4), (4, 1)])
