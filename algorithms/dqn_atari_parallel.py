@@ -7,7 +7,7 @@
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the
-choice of the precision and the count of dead units.
+choice of the precision, RMSProp and the count of dead units.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
     network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
@@ -34,8 +34,7 @@ Deviations, beside those of dqn_atari.py
                                           evaluations at the next step        together
     ℬ ⊆ 𝒟                                 each process draws its share of ℬ   no transition travels
                                           from its part of 𝒟
-    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam does not mind;
-                                                                              RMSProp learns slower
+    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam does not mind
     A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
     acts until that holds the initial number, then learns on. On several machines all need runs/.
 """
@@ -119,8 +118,8 @@ class Args:
     """transitions in the replay memory before learning starts [8: 50,000]"""
     agent_replay_buffer_maximum_length: int = 1_000_000
     """transitions that the replay memory holds; the oldest give way"""
-    optimizer_name: Literal["Adam", "RMSprop"] = "Adam"
-    """Adam, or the RMSProp of [8] with the constants of Figure 18"""
+    optimizer_name: Literal["Adam"] = "Adam"
+    """the RMSProp of [8] is in dqn_atari.py alone"""
     optimizer_minibatch_size: int = 32
     """transitions in a minibatch"""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
@@ -386,34 +385,6 @@ def initialize_orthogonal(q_network: QNetwork) -> None:
 # ---- algorithm: deep Q-learning ------------------------------------------------------------------
 
 
-class NatureRMSprop(torch.optim.Optimizer):
-    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the
-    root. PyTorch's adds it outside; "gradient momentum 0.95" is the decay of the mean gradient."""
-
-    def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
-        super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
-
-    @torch.no_grad()
-    def step(self) -> None:
-        for group in self.param_groups:
-            for θ in group["params"]:
-                state = self.state[θ]
-                if not state:
-                    state["g"], state["n"] = torch.zeros_like(θ), torch.zeros_like(θ)
-                # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
-                g = state["g"].lerp_(θ.grad, 1 - group["decay"])
-                n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
-                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
-                θ.addcdiv_(θ.grad, root, value=-group["lr"])
-
-
-def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
-    """Table 3's Adam, or Figure 18's RMSProp."""
-    if args.optimizer_name == "Adam":
-        return torch.optim.Adam(q_network.parameters(), lr=args.optimizer_learning_rate, fused=True)
-    return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
-
-
 def epsilon_at(frame: int, args: Args) -> float:
     """ε: linear from ε_initial at frame 0 to ε_final at frame `annealing`, then constant."""
     initial = args.agent_epsilon_greedy_epsilon_initial
@@ -603,7 +574,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     q_network = QNetwork(args.agent_history_length, *shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
-    optimizer = make_optimizer(args, q_network)
+    learning_rate = args.optimizer_learning_rate
+    optimizer = torch.optim.Adam(q_network.parameters(), lr=learning_rate, fused=True)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
     # 5-7  ε is a function of the frame; the rest is counted.

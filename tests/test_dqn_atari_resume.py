@@ -79,7 +79,9 @@ def child(*arguments, limit: int = -1) -> subprocess.CompletedProcess:
 
 
 def plain(value):
-    """Tensors as arrays' bytes, so that == compares everything."""
+    """Tensors as arrays' bytes and floats as text, so that == compares everything, NaN too."""
+    if isinstance(value, float):
+        return repr(value)
     if torch.is_tensor(value):
         return value.shape, value.dtype, value.contiguous().numpy().tobytes()
     if isinstance(value, dict):
