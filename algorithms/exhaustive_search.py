@@ -52,7 +52,7 @@ class Args:
     max_policies: int = 10_000
     """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to the largest |V|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -93,8 +93,8 @@ def policies(P: sparse.csr_array, first_row: np.ndarray, start: np.ndarray) -> I
             stack.append(np.where(np.arange(len(policy)) == s, row, policy))
 
 
-def evaluate(P, R, policy: np.ndarray, warm: np.ndarray, args: Args) -> tuple[np.ndarray, int, int]:
-    """V^π (S,), its sweeps from `warm` (S,), and from V = 0; NaN if π has no value."""
+def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndarray, int, int]:
+    """V^π (S,) of π (S,), its sweeps from `warm` (S,) and from V = 0; NaN where π never comes."""
     states = np.flatnonzero(policy >= 0)  # (n,)
     P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
@@ -116,7 +116,7 @@ def exhaustive_search(P, R, first_row, start: np.ndarray, args: Args) -> tuple:
         raise SystemExit(f"error: there are more than {args.max_policies} policies")
     current_max, best, tried, warm = -np.inf, None, [], np.zeros(len(start))  # warm: (S,)
     for policy in tqdm(candidates, "exhaustive search", unit=" policies", delay=2, leave=False):
-        V, sweeps, sweeps_from_0 = evaluate(P, R, policy, warm, args)  # Algorithm 2, line 5
+        V, sweeps, sweeps_from_0 = evaluate_policy(P, R, policy, warm, args)  # Algorithm 2, line 5
         warm = np.where(policy >= 0, V, warm)  # what the policies have in common is known
         value = start[start > 0] @ V[start > 0]
         tried.append((value, sweeps, sweeps_from_0))
@@ -135,7 +135,7 @@ def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + discount * (P @ V), V  # (n,)
         changes.append(float(np.abs(V - V_old).max(initial=0)))
-        if changes[-1] <= tolerance * np.abs(V).max(initial=1):
+        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
             return V, changes
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
@@ -190,6 +190,7 @@ def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
             model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
             grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
         model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+        assert model, "no states"
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
     return model, np.eye(1, len(model))[0] if start is None else start, grid
@@ -201,19 +202,21 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
-        p, next_states, rewards, ends = zip(*transitions, strict=True)
-        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
-        finite = np.isfinite(rewards).all()
-        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
-            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
-        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
-        R.append(np.dot(p, rewards))
+        try:
+            p, _, rewards, _ = zip(*transitions, strict=True)
+            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+                raise ValueError
+            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            R.append(np.dot(p, rewards))
+        except Exception:  # wrong numbers, an unknown next state, or not four values
+            line = f"error: state {s}, action {a}: {transitions} makes no sense"
+            raise SystemExit(line) from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
-    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
+    return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:

@@ -18,8 +18,6 @@ Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
     Of actions that tie, the policy takes one that ends soonest: at discount 1 an argmax may walk to
     and fro for ever.
-    A loop without rewards that never ends gives no constraint: its V of 0 is not found where every
-    way to the end costs.
 """
 
 import functools
@@ -79,12 +77,18 @@ def linear_program(P, R, first_row: np.ndarray, discount: float) -> tuple[np.nda
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
     counts = np.diff(first_row, append=len(R))  # (S,) |A_s|
     E = sparse.eye_array(len(first_row), format="csr")[np.repeat(np.arange(len(counts)), counts)]
-    tolerances = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    digits = float(np.clip(1e-16 * np.abs(R).max(), 1e-10, 1e-7))  # of a reward of 1e9, fewer
+    tolerances = {"primal_feasibility_tolerance": digits, "dual_feasibility_tolerance": 1e-10}
+    # Easy to get wrong: who may stay for nothing has V ≥ 0; at discount 1 no constraint says so.
+    idle, before = np.ones(len(counts), bool), None  # (S,)
+    while not np.array_equal(idle, before):
+        idle, before = maximum((np.abs(R) <= 1e-9) & (P @ ~idle <= 0), first_row), idle
+    bounds = np.stack([np.where(idle, 0, -np.inf), np.full(len(counts), np.inf)], axis=1)  # (S, 2)
     program = optimize.linprog(
-        np.ones(len(first_row)), discount * P - E, -R, bounds=(None, None), options=tolerances
+        np.ones(len(counts)), discount * P - E, -R, bounds=bounds, options=tolerances
     )
     if program.x is None:  # infeasible: V* is +∞ somewhere; unbounded: -∞
-        raise SystemExit(f"error: V* is not finite: {program.message.splitlines()[0]}")
+        raise SystemExit(f"error: V* is not found: {program.message.splitlines()[0]}")
     return program.x, int(program.nit)  # (S,)
 
 
@@ -96,26 +100,28 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
     """max_a Q(s, a): (rows,) → (S,)."""
-    width = len(Q) // len(first_row)
-    if (first_row == width * np.arange(len(first_row))).all():  # as many actions in every state:
+    width, rest = divmod(len(Q), len(first_row))
+    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():  # |A_s| is the same
         return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
     return np.maximum.reduceat(Q, first_row)  # (S,)
 
 
-def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """π (S,) int, a row for each state. Of the best actions that tie, one that ends soonest."""
+def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
+    tie, π takes one that ends soonest."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.9^steps to the end, or to where V stays 0.
-    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, 1 - P.sum(axis=1))  # (rows,)
+    # tied actions take the one with most 0.995^steps to the end, or to where V stays 0.
+    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) without the rounding errors of sums to 1
+    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, ends)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.9 * (end + P @ near), -1)  # (rows,)
+        nearness = np.where(tied, 0.995 * (end + P @ near), -1)  # (rows,)
         near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)]  # (S,) the first of each state
+    return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
@@ -139,6 +145,7 @@ def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
             model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
             grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
         model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+        assert model, "no states"
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
     return model, np.eye(1, len(model))[0] if start is None else start, grid
@@ -150,19 +157,21 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
-        p, next_states, rewards, ends = zip(*transitions, strict=True)
-        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
-        finite = np.isfinite(rewards).all()
-        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
-            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
-        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
-        R.append(np.dot(p, rewards))
+        try:
+            p, _, rewards, _ = zip(*transitions, strict=True)
+            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+                raise ValueError
+            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            R.append(np.dot(p, rewards))
+        except Exception:  # wrong numbers, an unknown next state, or not four values
+            line = f"error: state {s}, action {a}: {transitions} makes no sense"
+            raise SystemExit(line) from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
-    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
+    return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
@@ -208,7 +217,7 @@ def main(args: Args) -> None:
             for transitions in actions.values():
                 print(f"V({s}) ≥ {worked(transitions, args.discount, unknowns)}")
         print()
-    policy = greedy_policy(P, R, first_row, Q)
+    policy, _ = greedy_policy(P, R, first_row, Q)
     residual = np.abs(maximum(Q, first_row) - V).max()
     report(args.output_json, model, V, Q, policy, iterations, residual)
 

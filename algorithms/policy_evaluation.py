@@ -54,7 +54,7 @@ class Args:
     policy: str = ""
     """such as "s0=a2 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to the largest |V|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -89,7 +89,7 @@ def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + discount * (P @ V), V  # (n,)
         changes.append(float(np.abs(V - V_old).max(initial=0)))
-        if changes[-1] <= tolerance * np.abs(V).max(initial=1):
+        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
             return V, changes
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
@@ -154,6 +154,7 @@ def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
             model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
             grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
         model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+        assert model, "no states"
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
     return model, np.eye(1, len(model))[0] if start is None else start, grid
@@ -165,19 +166,21 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
-        p, next_states, rewards, ends = zip(*transitions, strict=True)
-        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
-        finite = np.isfinite(rewards).all()
-        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
-            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
-        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
-        R.append(np.dot(p, rewards))
+        try:
+            p, _, rewards, _ = zip(*transitions, strict=True)
+            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+                raise ValueError
+            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            R.append(np.dot(p, rewards))
+        except Exception:  # wrong numbers, an unknown next state, or not four values
+            line = f"error: state {s}, action {a}: {transitions} makes no sense"
+            raise SystemExit(line) from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
-    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
+    return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def read_policy(text: str, model: dict) -> np.ndarray:
@@ -233,13 +236,13 @@ def print_evaluation(model: dict, states, policy, discount: float, exact, sweeps
     names = [list(model)[s] for s in states]
     rows = [transitions for actions in model.values() for transitions in actions.values()]
     chosen = [rows[row] for row in policy[states]]
-    unknowns = {s: f"V({s})" for s in names}
+    unknowns = {s: f"V({s})" for s in model}
     for s, transitions, v in zip(names, chosen, exact, strict=True):
-        fraction = Fraction(v).limit_denominator(1000)
+        fraction = Fraction(v).limit_denominator(1_000_000)
         print(f"V({s}) = {worked(transitions, discount, unknowns)} = {fraction}")
     print()
     table, V = [["0"] * len(names)], np.zeros(len(model))  # (S,)
-    for _ in range(sweeps):
+    for _ in range(min(sweeps, 9)):
         texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
         V[states] = backup(*arrays(model)[:2], V, discount)[policy[states]]
         cells = zip(chosen, V[states], strict=True)

@@ -52,7 +52,7 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to the largest |V|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -87,8 +87,8 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
     """max_a Q(s, a): (rows,) → (S,)."""
-    width = len(Q) // len(first_row)
-    if (first_row == width * np.arange(len(first_row))).all():  # as many actions in every state:
+    width, rest = divmod(len(Q), len(first_row))
+    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():  # |A_s| is the same
         return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
     return np.maximum.reduceat(Q, first_row)  # (S,)
 
@@ -98,32 +98,35 @@ def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_itera
 
     Exits if V has not converged after max_iterations.
     """
-    V, changes = np.zeros(len(first_row)), [np.inf]  # (S,)
+    V, changes, converged = np.zeros(len(first_row)), [], False  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         Q = backup(P, R, V, discount)  # (rows,)
         V, V_old = maximum(Q, first_row), V  # (S,)
-        changes.append(float(np.abs(V - V_old).max()))
-        # Q is a step behind V: it takes one sweep more after V has converged.
-        if changes[-2] <= tolerance * max(1.0, V.max(), -V.min()):
-            return V, Q, changes[1:]
+        change = np.abs(V - V_old)  # (S,)
+        changes.append(float(change.max()))
+        if converged:  # Q is a step behind V: it takes one sweep more after V has converged
+            return V, Q, changes
+        converged = (change <= tolerance * np.maximum(1, np.abs(V))).all()
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps; V* may be infinite")
 
 
-def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """π (S,) int, a row for each state. Of the best actions that tie, one that ends soonest."""
+def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
+    tie, π takes one that ends soonest."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.9^steps to the end, or to where V stays 0.
-    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, 1 - P.sum(axis=1))  # (rows,)
+    # tied actions take the one with most 0.995^steps to the end, or to where V stays 0.
+    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) without the rounding errors of sums to 1
+    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, ends)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.9 * (end + P @ near), -1)  # (rows,)
+        nearness = np.where(tied, 0.995 * (end + P @ near), -1)  # (rows,)
         near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)]  # (S,) the first of each state
+    return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
@@ -147,6 +150,7 @@ def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
             model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
             grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
         model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
+        assert model, "no states"
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
     return model, np.eye(1, len(model))[0] if start is None else start, grid
@@ -158,19 +162,21 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, transitions) for s in model for a, transitions in model[s].items()]
+    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
-        p, next_states, rewards, ends = zip(*transitions, strict=True)
-        known = all(end or str(n) in number for n, end in zip(next_states, ends, strict=True))
-        finite = np.isfinite(rewards).all()
-        if not (known and finite and min(p) >= 0 and abs(sum(p) - 1) <= 1e-9):
-            raise SystemExit(f"error: state {s}, action {a}: {transitions} makes no sense")
-        entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if not end]
-        R.append(np.dot(p, rewards))
+        try:
+            p, _, rewards, _ = zip(*transitions, strict=True)
+            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+                raise ValueError
+            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            R.append(np.dot(p, rewards))
+        except Exception:  # wrong numbers, an unknown next state, or not four values
+            line = f"error: state {s}, action {a}: {transitions} makes no sense"
+            raise SystemExit(line) from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
-    return P, np.array(R), np.cumsum([0, *map(len, model.values())])[:-1]
+    return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
@@ -215,23 +221,25 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
-def save_figure(path: Path, P, policy, V, grid: tuple, curve: list[float], label: str) -> None:
-    """Draw the curve and, in a grid world, V (S,) as colours and π (S,) as arrows."""
+def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> None:
+    """Draw the changes and, in a grid world, V (S,) as colours and π (S,) as arrows."""
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(range(1, len(curve) + 1), curve, marker=".")
-    left.set(xlabel="iteration", ylabel=label, yscale="log" if min(curve) >= 0 else "linear")
+    left.plot(range(1, len(changes) + 1), changes, marker=".")
+    left.set(xlabel="iteration", ylabel="max |V_i - V_i-1|")
+    left.set_yscale("log" if max(changes) > 0 else "linear")
     if len(grid) == 2 and np.prod(grid) == len(V):
         place = np.stack(np.divmod(np.arange(len(V)), grid[1])[::-1], axis=1)  # (S, 2) x, y
         step = P @ place - P.sum(axis=1)[:, None] * np.repeat(place, P.shape[0] // len(V), axis=0)
+        step[(np.abs(step) > 1).any(axis=1)] = 0  # a jump back to the start is no step
         # An action's arrow is its mean step over the states: slips cancel out.
-        arrow = np.clip(step, -1, 1).reshape(len(V), -1, 2).mean(axis=0)  # (A, 2)
-        acts = P.sum(axis=1)[policy] > 0  # (S,) no hole, no goal
+        arrow = step.reshape(len(V), -1, 2).mean(axis=0)  # (A, 2)
+        acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, no goal
         image = right.imshow(np.where(acts, V, np.nan).reshape(grid))
         figure.colorbar(image, label="V(s)", shrink=0.8)
         u, v = arrow[policy[acts] % len(arrow)].T  # (cells,) each
-        longest = 2 * np.abs(arrow).max()
-        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=longest)
+        scale = 2 * np.abs(arrow).max()  # the longest arrow is half a cell
+        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=scale)
         right.set(title="V and π")
     figure.savefig(path, format="png", dpi=120)
 
@@ -244,10 +252,12 @@ def main(args: Args) -> None:
     model, _, grid = read_model(args)
     P, R, first_row = mdp = arrays(model)
     V, Q, changes = value_iteration(*mdp, args.discount, args.tolerance, args.max_iterations)
-    policy = greedy_policy(P, R, first_row, Q)
+    policy, ends = greedy_policy(P, R, first_row, Q)
+    if args.discount == 1 and (np.abs(V[~ends]) > 1e-9).any():
+        raise SystemExit("error: V has converged to more than any policy gets: it walks in a loop")
     if len(R) <= 12:  # small enough to be worked through on paper
         values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]  # V_0, V_1, ... once more
-        for _ in changes:
+        for _ in changes[:9]:
             Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
             values.append(maximum(Q_i, first_row))  # (S,)
@@ -255,7 +265,7 @@ def main(args: Args) -> None:
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
     report(args.output_json, model, V, Q, policy, len(changes), changes[-1])
     if args.figure:
-        save_figure(args.figure, P, policy, V, grid, changes, "max |V_i - V_i-1|")
+        save_figure(args.figure, P, policy, V, grid, changes)
 
 
 if __name__ == "__main__":

@@ -1,173 +1,81 @@
-"""What the tests of the five known-MDP scripts share: models, random models, independent oracles, the command line."""
+"""What the tests of the five known-MDP scripts share: two ways to run one, independent oracles."""
 
+import importlib
 import itertools
 import json
-import re
 
-import exhaustive_search
-import linear_program
 import numpy as np
-import policy_evaluation
-import policy_iteration
-import value_iteration
-from scipy import sparse
+import pytest
 
-SCRIPTS = [policy_evaluation, exhaustive_search, value_iteration, policy_iteration, linear_program]
-SOLVERS = SCRIPTS[1:]  # those that look for the best policy
-
-# Models at discount 1 that a peer refuses, loops on for ever, or answers wrongly.
-TO_AND_FRO = {  # the agent may walk to and fro for nothing, which ties with going to the goal
-    "start": "left",
-    "terminal": ["goal"],
-    "transitions": {
-        "left": {"right": [[1, "right", 0]]},
-        "right": {"left": [[1, "left", 0]], "out": [[1, "goal", 1]]},
-    },
-}
-BETTER_STAY = {  # to stay for nothing is worth 0, to leave costs
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {
-        "s": {"out": [[1, "goal", -1]], "step": [[1, "t", 0]]},
-        "t": {"out": [[1, "goal", -3]], "back": [[1, "s", 0]]},
-    },
-}
-ENDLESS_GAIN = {  # +2 and -1, round and round
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {
-        "s": {"out": [[1, "goal", 0]], "step": [[1, "t", 2]]},
-        "t": {"back": [[1, "s", -1]]},
-    },
-}
-PURE_GAIN = {
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {"s": {"out": [[1, "goal", 5]], "stay": [[1, "s", 1]]}},
-}
-TRAP = {  # no policy leaves t, and t costs
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {"s": {"out": [[1, "goal", 1]], "in": [[1, "t", 0]]}, "t": {"stay": [[1, "t", -1]]}},
-}
-CANCELLING = {  # -1 and +1, round and round: the sums have no limit
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {
-        "s": {"step": [[1, "t", -1]], "out": [[1, "goal", -10]]},
-        "t": {"back": [[1, "s", 1]], "out": [[1, "goal", -10]]},
-    },
-}
-
-FORBIDDEN = {  # to do a3 ends in a fine of 1e9; beside it 1 and 1.5 are still not the same
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {
-        "s": {"a1": [[1, "goal", 1]], "a2": [[1, "goal", 1.5]], "a3": [[1, "goal", -1e9]], "a4": [[1, "pit", 0]]},
-        "pit": {"out": [[1, "goal", -1e9]]},
-    },
-}
-FAIR_LOOP = {  # 0.1·3 - 0.3·1 is nothing, in floating point too
-    "start": "s",
-    "terminal": ["goal"],
-    "transitions": {"s": {"bet": [[0.1, "s", 3], [0.3, "s", -1], [0.6, "s", 0]], "out": [[1, "goal", -1]]}},
-}
+SOLVERS = "exhaustive_search value_iteration policy_iteration linear_program".split()
+SCRIPTS = list(map(importlib.import_module, ["policy_evaluation", *SOLVERS]))
 
 
-def run(module, monkeypatch, capsys, *flags):
-    """A script's main in this process: (exit code, standard output, standard error)."""
-    monkeypatch.setattr("sys.argv", [module.__name__, *map(str, flags)])
-    code = 0
-    try:
-        module.main()
-    except SystemExit as stop:
-        code = stop.code
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
+def go(state, reward=0.0, p=1.0):
+    """One transition; "goal" ends the episode."""
+    return [p, state, reward, state == "goal"]
 
 
-def tables(output):
-    """The printed tables, as lists of rows (headers first) of cells; a column that is empty in a row is left out."""
-    blocks = re.split(r"\n\s*\n", output)
-    found = []
-    for block in blocks:
-        lines = block.splitlines()
-        for i, line in enumerate(lines):
-            if i and re.fullmatch(r"[- ]*-[- ]*", line):
-                found.append([re.split(r"\s{2,}", row.strip()) for row in [lines[i - 1], *lines[i + 1 :]]])
-    return found
+def run(script, folder, model=None, **settings):
+    """What a script's main writes as JSON, of a model (written as JSON too) or an environment."""
+    if model is not None:
+        settings["model"] = folder / "model.json"
+        settings["model"].write_text(model if isinstance(model, str) else json.dumps(model))
+    script.main(script.Args(output_json=folder / "out.json", **settings))
+    result = json.loads((folder / "out.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert list(result) == ["values", "action_values", "policy", "iterations", "residual"]
+    (folder / "out.json").unlink()
+    return result
 
 
-def written(path, model):
-    """The path, after the model has been written there as JSON."""
-    path.write_text(json.dumps(model), encoding="utf-8")
-    return path
+def refused(script, folder, model=None, **settings):
+    """The one line with which a script ends; it has written nothing."""
+    with pytest.raises(SystemExit) as stop:
+        run(script, folder, model, **settings)
+    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code  # exit code 1
+    assert {path.name for path in folder.iterdir()} <= {"model.json"}
+    return stop.value.code
+
+
+def tables(text):
+    """The printed tables: rows of cells, without the header and the column of i."""
+    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("i  ")]
+    return [[[cell.strip() for cell in line.split("  ") if cell][1:] for line in block[1:]]
+            for block in blocks]  # fmt: skip
+
+
+def q_row(v1, q1, v1_, v2, q2, v0, q3):
+    """A row of the lecture's tables of Q."""
+    return [f"1·[10 + {v1}] = {q1}", f"0.6·[10 + {v1_}] + 0.4·[5 + {v2}] = {q2}",
+            "1·[1 + 0] = 1", "1·[1 + 0] = 1", f"0.7·[1 + 0] + 0.3·[0 + {v0}] = {q3}"]  # fmt: skip
 
 
 def random_model(rng, proper):
-    """A small model with ragged actions, one or two terminals and ties; `proper`: every action may end the episode."""
-    size, goals = int(rng.integers(1, 5)), [f"g{k}" for k in range(rng.integers(1, 3))]
-    states = [f"s{s}" for s in range(size)]
-    transitions = {}
-    for state in states:
-        actions = {}
-        for a in range(rng.integers(1, 4)):
-            if actions and rng.random() < 0.3:
-                actions[f"a{a}"] = actions[rng.choice(list(actions))]  # a tie
-                continue
-            names = list(rng.choice(states + goals, size=rng.integers(1, 4)))
-            names += [rng.choice(goals)] if proper else []
-            weights = rng.integers(1, 9, len(names))
-            outcomes = zip(weights / weights.sum(), names, rng.integers(-5, 6, len(names)), strict=True)
-            actions[f"a{a}"] = [[float(p), str(s_next), int(r)] for p, s_next, r in outcomes]
-        transitions[state] = actions
-    return {"start": "s0", "terminal": goals, "transitions": transitions}
+    """Ragged action sets, ties, p = 0, now and then a fine of 1e9; proper: any action may end."""
+    model = {f"s{i}": {} for i in range(rng.integers(1, 5))}
+    rewards = [*range(-5, 6), -1e9 if rng.random() < 0.2 else 0]
+    for s in model:
+        for a in map(str, range(rng.integers(1, 4))):
+            names = [*rng.choice([*model, "goal"], rng.integers(1, 4)), *["goal"] * proper]
+            weights = rng.integers(0, 9, len(names)) + np.eye(len(names))[-1]
+            ways = zip(names, rng.choice(rewards, len(names)), weights / weights.sum(), strict=True)
+            tie = rng.random() < 0.3 and model[s].get("0")
+            model[s][a] = tie or [go(str(n), float(r), p) for n, r, p in ways]
+    return model
 
 
-def dense_values(model, policy, discount):
-    """{state: V^π} of {state: action} for all non-terminal states, by numpy.linalg.solve from the JSON."""
-    states = list(model["transitions"])
-    A, b = np.eye(len(states)), np.zeros(len(states))
-    for i, state in enumerate(states):
-        for p, s_next, r in model["transitions"][state][policy[state]]:
-            b[i] += p * r
-            if s_next in states:
-                A[i, states.index(s_next)] -= discount * p
-    return dict(zip(states, np.linalg.solve(A, b).tolist(), strict=True))
+def dense(model, policy, discount):
+    """V (S,) of a policy {state: action} by a dense system."""
+    A, b, number = np.eye(len(model)), np.zeros(len(model)), {s: i for i, s in enumerate(model)}
+    for s, a in policy.items():
+        for p, s_next, r, end in model[s][a]:
+            b[number[s]] += p * r
+            A[number[s], number.get(s_next, 0)] -= 0 if end else discount * p
+    return np.linalg.solve(A, b)
 
 
-def best_values(model, discount):
-    """{state: V*} as the largest V^π of all assignments of actions, where every one of them has finite values."""
-    states = list(model["transitions"])
-    best = dict.fromkeys(states, -np.inf)
-    for actions in itertools.product(*(model["transitions"][state] for state in states)):
-        values = dense_values(model, dict(zip(states, actions, strict=True)), discount)
-        best = {state: max(best[state], values[state]) for state in states}
-    return best
-
-
-def solve(module, mdp, discount):
-    """The solution of one of the four solvers by its Python function."""
-    if module is exhaustive_search:
-        return module.exhaustive_search(mdp, discount, 1e-12, 100_000, 10**6)[0]
-    if module is policy_iteration:
-        return module.policy_iteration(mdp, mdp.first_row, discount, 1e-9, 1000)[0]
-    if module is linear_program:
-        return module.linear_program(mdp, discount, 1e-12, 100_000)[0]
-    V, Q, changes, history = module.value_iteration(mdp, discount, 1e-12, 100_000)
-    tied = module.tied_rows(mdp, Q, 1e-12)
-    policy = module.greedy_policy(mdp, Q, tied, discount)
-    return module.Solution(V, Q, policy, tied, len(changes), changes[-1], changes, history)
-
-
-def sparse_mdp(module, rng, size, actions=4, successors=5):
-    """A random MDP of a script, made from arrays alone: no terminal states, rewards in [0, 1)."""
-    rows = size * actions
-    weights = rng.random((rows, successors))
-    weights /= weights.sum(axis=1, keepdims=True)
-    indices, indptr = rng.integers(0, size, rows * successors), np.arange(rows + 1) * successors
-    P = sparse.csr_array((weights.ravel(), indices, indptr), shape=(rows, size))
-    start = np.zeros(size)
-    start[0] = 1
-    first_row, terminal = np.arange(size) * actions, np.zeros(size, bool)
-    return module.MDP(range(size), np.tile(np.arange(actions), size), first_row, P, rng.random(rows), start, terminal)
+def brute(model, discount):
+    """V* (S,): the best of every policy."""
+    choices = itertools.product(*model.values())
+    policies = [dict(zip(model, actions, strict=True)) for actions in choices]
+    return np.max([dense(model, policy, discount) for policy in policies], axis=0)
