@@ -7,6 +7,8 @@
 # ///
 r"""Deep Q-Learning on Atari games (ECE 544NA, Lecture 27, §5.3 and §7, Algorithm 6): the method of
 Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), here [8].
+The algorithm is `update` and the loop of `main`; all else serves them. The flags are Table 3's, in
+its order, and from --env-id on this script's own.
 
 Run it
     python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4     # Table 3, 10 million frames
@@ -69,8 +71,8 @@ REPORT_INTERVAL = 2_000  # frames between two points of a curve
 
 @dataclasses.dataclass
 class Args:
-    """A FRAME is what the agent observes: one action, 4 emulator frames. Every count is in frames.
-    An EPISODE is one life while training; a GAME ends with the last life."""
+    """A FRAME is what the agent observes: one action, 4 emulator frames. Counts are in frames
+    unless a flag says otherwise. An EPISODE is a life while training; a GAME ends with the last."""
 
     # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
@@ -146,12 +148,15 @@ def read_args() -> Args:
     args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
     if args.resume:
         try:
-            saved = Args(**json.loads((Path(args.resume) / "args.json").read_text()))
+            saved = json.loads((Path(args.resume) / "args.json").read_text())
+            if set(saved) != set(vars(args)):
+                raise ValueError("its flags are another script's")
         except (OSError, ValueError, TypeError) as error:
-            raise SystemExit(f"error: {args.resume} is no run directory: {error}") from None
-        args = tyro.cli(Args, default=saved)
-        changed = {name for name, value in vars(args).items() if value != getattr(saved, name)}
-        if not changed <= {"resume", "environment_train_frames_max"}:
+            raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
+        args = tyro.cli(Args, default=Args(**saved))  # the run's own flags are now the defaults
+        changed = {name for name, value in vars(args).items() if value != saved[name]}
+        longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
+        if not longer or not changed <= {"resume", "environment_train_frames_max"}:
             raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
@@ -173,7 +178,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3): `meanings`."""
+    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
+    `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -197,7 +203,7 @@ class NoOpReset(gym.Wrapper):
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, _, _, info = self.env.step(0)
+            screen, _, _, _, info = self.env.step(0)  # NOOP
         return screen, info
 
 
@@ -265,7 +271,8 @@ class FrameHistory(gym.Wrapper):
 
 
 def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.Env:
-    """The game with the transformations of Figure 16 (training) or 17 (without the last `if`).
+    """The game with the transformations of Figure 16 (training) or 17 (evaluation: no clipping,
+    no LifeLoss).
 
     Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
     Exits with one line for a name that is no Atari game.
@@ -278,7 +285,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
-    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
@@ -299,7 +306,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 class ReplayMemory:
     """𝒟: the last `capacity` transitions (§5.3). One is references to its 5 frames, an action, a
     clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
-    Each is whole in itself, so none can mix two episodes or cross the place of the oldest."""
+    Each is whole in itself, so none can mix two episodes."""
 
     def __init__(self, capacity: int, shape: tuple[int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -346,9 +353,9 @@ class ReplayMemory:
 
     def load_state_dict(self, saved: dict) -> None:
         """Take over what `state_dict` gave."""
-        joined = saved["frames"].numpy().tobytes()
+        joined = memoryview(saved["frames"].numpy())
         ends = saved["lengths"].cumsum(dim=0).tolist()
-        unique = [joined[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        unique = [bytes(joined[i:j]) for i, j in zip([0, *ends[:-1]], ends, strict=True)]
         self.added = saved["added"]
         for i, places in enumerate(saved["places"].tolist()):
             self.frames[i] = tuple(unique[place] for place in places)
@@ -381,11 +388,52 @@ class QNetwork(nn.Module):
 
 def initialize_orthogonal(q_network: QNetwork) -> None:
     """Orthogonal convolution filters (§7.5.1); everything else stays PyTorch's default."""
-    for i in (0, 2, 4):
+    for i in (0, 2, 4):  # the convolutions
         nn.init.orthogonal_(q_network.layers[i].weight)
 
 
 # ---- algorithm: deep Q-learning ------------------------------------------------------------------
+
+
+def epsilon_at(frame: int, args: Args) -> float:
+    """ε: linear from ε_initial at frame 0 to ε_final at frame `annealing`, then constant."""
+    initial = args.agent_epsilon_greedy_epsilon_initial
+    final = args.agent_epsilon_greedy_epsilon_final
+    return initial + min(frame / args.agent_epsilon_greedy_annealing, 1.0) * (final - initial)
+
+
+@torch.inference_mode()
+def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
+    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
+    is (4, 84, 84) uint8."""
+    if rng.random() < epsilon:
+        return int(rng.integers(q_network.head.out_features))
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
+
+
+def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
+    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
+    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
+    `minibatch` is what the replay memory's gather returns."""
+    s, a, r, s_next, terminal = minibatch
+    with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        # Q(s_j, a_j; θ)
+        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
+
+        # y_j = r_j                                     if s_{j+1} is terminal
+        #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)       else                       (Equation 37)
+        with torch.no_grad():
+            y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
+
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
+    # as in line 22: the RMSProp of [8] is meant for it; Adam's steps do not depend on the scale.
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
+    assert q.shape == y.shape == r.shape
+    loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss.detach() / len(r), q.detach()
 
 
 class NatureRMSprop(torch.optim.Optimizer):
@@ -416,47 +464,6 @@ def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
     return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
 
 
-def epsilon_at(frame: int, args: Args) -> float:
-    """ε: linear from ε_initial at frame 0 to ε_final at frame `annealing`, then constant."""
-    initial = args.agent_epsilon_greedy_epsilon_initial
-    final = args.agent_epsilon_greedy_epsilon_final
-    return initial + min(frame / args.agent_epsilon_greedy_annealing, 1.0) * (final - initial)
-
-
-@torch.inference_mode()
-def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
-    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
-    is (4, 84, 84) uint8."""
-    if rng.random() < epsilon:
-        return int(rng.integers(q_network.head.out_features))
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
-
-
-def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
-    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
-    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
-    `minibatch` is what ReplayMemory.gather returns."""
-    s, a, r, s_next, terminal = minibatch
-    with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        # y_j = r_j                                     if s_{j+1} is terminal
-        #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)       else                       (Equation 37)
-        with torch.no_grad():
-            y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
-
-        # Q(s_j, a_j; θ)
-        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
-
-    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
-    # as in line 22: RMSProp's constant is meant for it, and Adam does not mind.
-    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
-    assert q.shape == y.shape == r.shape
-    loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()
-    return loss.detach() / len(r), q.detach()
-
-
 def choose_precision(args: Args) -> str:
     """Time 30 updates in float32 and in bfloat16: the quicker by a tenth, else float32."""
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
@@ -464,11 +471,10 @@ def choose_precision(args: Args) -> str:
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
-    learner = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
+    inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
     def seconds(precision: str) -> float:
-        runs = timeit.repeat(lambda: update(*learner, precision)[0].item(), number=1, repeat=30)
-        return min(runs)
+        return min(timeit.repeat(lambda: update(*inputs, precision)[0].item(), number=1, repeat=30))
 
     best = {precision: seconds(precision) for precision in ("float32", "bfloat16")}
     print(*(f"{precision}: {1000 * best[precision]:.1f} ms an update" for precision in best))
@@ -492,14 +498,13 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    seeds = np.random.SeedSequence([args.seed, number + 1]).spawn(2)  # [seed, 0] is training's
-    exploration_rng, no_op_rng = [np.random.default_rng(seed) for seed in seeds]
+    # [seed, 0] is training's
+    exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
     finished = []
     epsilon = args.agent_epsilon_greedy_epsilon_evaluation
-    name = "evaluation" if number else "final test"
-    for _ in tqdm(range(args.environment_test_frames), name, leave=False, mininterval=1):
+    for _ in tqdm(range(args.environment_test_frames), "evaluation", leave=False, mininterval=1):
         action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
         state, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
@@ -636,7 +641,7 @@ def main(args: Args) -> None:
     args.threads = torch.get_num_threads()
     if args.device == "auto":
         args.device = "cuda" if torch.cuda.is_available() else "cpu"
-    rngs = [np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(3)]
+    rngs = np.random.default_rng([args.seed, 0]).spawn(3)
     exploration_rng, minibatch_rng, no_op_rng = rngs
 
     # 1  Initialize the Atari 2600 simulator.
@@ -666,17 +671,21 @@ def main(args: Args) -> None:
         counters = restore(run_dir / "checkpoint.pt", parts, env, rngs)
         s = env.get_wrapper_attr("history")
     write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
+    (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
 
     def save_q_network() -> None:
         """What it takes to play."""
+        if not loss.isfinite():  # a NaN never leaves the weights again
+            raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
                    "q_network": q_network.state_dict()}
         write_file(run_dir / "q_network.pt", lambda path: torch.save(content, path))
 
     def save_checkpoint() -> None:
         """Everything: on a CPU a resumed run is bit for bit the run that never stopped."""
+        save_q_network()
         writer.flush()
         content = {name: part.state_dict() for name, part in parts.items()}
         content["environment"] = environment_state(env)
@@ -709,7 +718,7 @@ def main(args: Args) -> None:
         if episode_ended:
             counters.episodes += 1
             s, _ = env.reset()
-        if "episode" in info:  # the game has ended, too
+        if "episode" in info:  # a game, not only a life: the statistics are below LifeLoss
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
             bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)
@@ -741,8 +750,6 @@ def main(args: Args) -> None:
         bar.update()
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
-            if not loss.isfinite():  # it never leaves the weights again
-                raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
             scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
@@ -759,9 +766,7 @@ def main(args: Args) -> None:
 
     # 32  return θ
     bar.close()
-    if loss.isfinite():
-        save_checkpoint()
-    save_q_network()
+    save_checkpoint()
     if stop:
         print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
         raise SystemExit(128 + stop[0])
@@ -773,4 +778,7 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
-    main(read_args())
+    try:
+        main(read_args())
+    except OSError as error:  # TensorBoard's files, on a full disk
+        raise SystemExit(f"error: {error}") from None

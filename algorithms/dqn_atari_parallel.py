@@ -23,8 +23,6 @@ Run it
     torchrun --nnodes 2 --nproc-per-node 2 --rdzv-backend c10d --rdzv-id 1 \
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
-Measured: see README
-
 Deviations, beside those of dqn_atari.py
     Algorithm 6                           this file                           why
     ------------------------------------  ----------------------------------  --------------------
@@ -36,7 +34,8 @@ Deviations, beside those of dqn_atari.py
                                           from its part of 𝒟
     Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam does not mind
     A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
-    acts until that holds the initial number, then learns on. On several machines all need runs/.
+    acts until that holds the initial number, then learns on; its random numbers start anew. On
+    several machines all need runs/.
 """
 
 import copy
@@ -76,8 +75,8 @@ REPORT_INTERVAL = 2_000  # frames between two points of a curve
 
 @dataclasses.dataclass
 class Args:
-    """A FRAME is what the agent observes: one action, 4 emulator frames. Every count is in frames.
-    An EPISODE is one life while training; a GAME ends with the last life."""
+    """A FRAME is what the agent observes: one action, 4 emulator frames. Counts are in frames
+    unless a flag says otherwise. An EPISODE is a life while training; a GAME ends with the last."""
 
     # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
@@ -140,8 +139,6 @@ class Args:
     """of an update's layers"""
     num_simulators: int = 8
     """simulators of each process of torchrun"""
-    threads: int = 0
-    """CPU threads of PyTorch; 0 is PyTorch's own choice"""
     checkpoint_interval_minutes: float = 10.0
     """minutes between checkpoints of the learner"""
     resume: str = ""
@@ -155,12 +152,15 @@ def read_args() -> Args:
     args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
     if args.resume:
         try:
-            saved = Args(**json.loads((Path(args.resume) / "args.json").read_text()))
+            saved = json.loads((Path(args.resume) / "args.json").read_text())
+            if set(saved) != set(vars(args)):
+                raise ValueError("its flags are another script's")
         except (OSError, ValueError, TypeError) as error:
-            raise SystemExit(f"error: {args.resume} is no run directory: {error}") from None
-        args = tyro.cli(Args, default=saved)
-        changed = {name for name, value in vars(args).items() if value != getattr(saved, name)}
-        if not changed <= {"resume", "environment_train_frames_max"}:
+            raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
+        args = tyro.cli(Args, default=Args(**saved))  # the run's own flags are now the defaults
+        changed = {name for name, value in vars(args).items() if value != saved[name]}
+        longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
+        if not longer or not changed <= {"resume", "environment_train_frames_max"}:
             raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
@@ -182,7 +182,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3): `meanings`."""
+    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
+    `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -206,7 +207,7 @@ class NoOpReset(gym.Wrapper):
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, _, _, info = self.env.step(0)
+            screen, _, _, _, info = self.env.step(0)  # NOOP
         return screen, info
 
 
@@ -274,7 +275,8 @@ class FrameHistory(gym.Wrapper):
 
 
 def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.Env:
-    """The game with the transformations of Figure 16 (training) or 17 (without the last `if`).
+    """The game with the transformations of Figure 16 (training) or 17 (evaluation: no clipping,
+    no LifeLoss).
 
     Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
     Exits with one line for a name that is no Atari game.
@@ -287,7 +289,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
-    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
@@ -378,7 +380,7 @@ class QNetwork(nn.Module):
 
 def initialize_orthogonal(q_network: QNetwork) -> None:
     """Orthogonal convolution filters (§7.5.1); everything else stays PyTorch's default."""
-    for i in (0, 2, 4):
+    for i in (0, 2, 4):  # the convolutions
         nn.init.orthogonal_(q_network.layers[i].weight)
 
 
@@ -404,29 +406,27 @@ def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
 @torch.inference_mode()
 def epsilon_greedy_batch(q_network, states: torch.Tensor, epsilon: float, rng) -> np.ndarray:
     """`epsilon_greedy` for each of the states (N, 4, 84, 84) uint8: N actions from one batch."""
-    actions = rng.integers(q_network.head.out_features, size=len(states))  # (N,)
-    greedy = rng.random(len(states)) >= epsilon  # (N,)
-    if greedy.any():
-        actions[greedy] = q_network(states[greedy]).argmax(dim=1).cpu()
-    return actions
+    random = rng.integers(q_network.head.out_features, size=len(states))  # (N,)
+    greedy = q_network(states).argmax(dim=1).cpu().numpy()  # (N,)
+    return np.where(rng.random(len(states)) < epsilon, random, greedy)
 
 
 def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
     """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
     in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
-    `minibatch` is what ReplayMemory.gather returns."""
+    `minibatch` is what the replay memory's gather returns."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        # Q(s_j, a_j; θ)
+        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
+
         # y_j = r_j                                     if s_{j+1} is terminal
         #       r_j + γ max_a' Q(s_{j+1}, a'; θ⁻)       else                       (Equation 37)
         with torch.no_grad():
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
-        # Q(s_j, a_j; θ)
-        q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
-
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
-    # as in line 22: RMSProp's constant is meant for it, and Adam does not mind.
+    # as in line 22: the RMSProp of [8] is meant for it; Adam's steps do not depend on the scale.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -452,14 +452,13 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    seeds = np.random.SeedSequence([args.seed, number + 1]).spawn(2)  # [seed, 0] is training's
-    exploration_rng, no_op_rng = [np.random.default_rng(seed) for seed in seeds]
+    # [seed, 0] is training's
+    exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
     finished = []
     epsilon = args.agent_epsilon_greedy_epsilon_evaluation
-    name = "evaluation" if number else "final test"
-    for _ in tqdm(range(args.environment_test_frames), name, leave=False, mininterval=1):
+    for _ in tqdm(range(args.environment_test_frames), "evaluation", leave=False, mininterval=1):
         action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
         state, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
@@ -559,8 +558,6 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
     # Adam's moments of dead units fade into denormal numbers, which make its step 10 times slower.
     torch.set_flush_denormal(True)  # before the first parallel work: threads inherit it
-    torch.set_num_threads(args.threads or torch.get_num_threads())
-    args.threads = torch.get_num_threads()
 
     # 1  Initialize the Atari 2600 simulators.
     actions = envs.get_attr("meanings")[0]
@@ -585,21 +582,25 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
     if args.resume:
         path = Path(args.resume) / "checkpoint.pt"
-        saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in the file
-        for name, part in parts.items():
-            part.load_state_dict(saved[name])
-        counters = Counters(**saved["counters"])
+        try:
+            saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in it
+            for name, part in parts.items():
+                part.load_state_dict(saved[name])
+            counters = Counters(**saved["counters"])
+        except Exception as error:  # a damaged file can raise anything
+            raise SystemExit(f"error: {path} cannot be resumed from: {error!r:.200}") from None
     # The same θ, under a wrapper that averages the gradients of all processes in backward().
     shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
     if rank == 0:
         run_dir, _lock = open_run(args, Path(__file__).stem)
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
+        (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
 
     def save() -> None:
         """q_network.pt, what it takes to play, and checkpoint.pt, what it takes to learn on."""
-        if not loss.isfinite():  # it never leaves the weights again
+        if not loss.isfinite():  # a NaN never leaves the weights again
             raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
         writer.flush()
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
@@ -632,12 +633,12 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
 
         # 9-12  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
         epsilon = epsilon_at(counters.frames - step, args)
-        states = replay.decode(frame for history in s for frame in history)  # (4 N, 84, 84)
-        states = states.unflatten(0, (len(s), -1))  # (N, 4, 84, 84)
+        states = replay.decode(sum(s, ())).unflatten(0, (len(s), -1))  # (N, 4, 84, 84)
         a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
         envs.step_async(a)
 
-        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while the simulators step.
+        # 18-23  If |𝒟| ≥ initial (before, `due` is 0): sample ℬ ⊆ 𝒟, gradient descent. The lines
+        # stand in another order than Algorithm 6's: the simulators step meanwhile.
         due = max(0, counters.frames - start) // args.agent_update_frequency
         for _ in range(updates_before + due - counters.updates):
             batch_size = args.optimizer_minibatch_size // ranks
@@ -655,7 +656,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         x, r, terminated, truncated, info = envs.step_wait()  # (N, 84, 84) uint8, (N,) each
         ended = terminated | truncated
         for i in range(args.num_simulators):
-            # Easy to get wrong: x[i] is then the next episode's first frame, not the end of s'.
+            # Easy to get wrong: after an end x[i] is the next episode's first frame (SAME_STEP),
+            # and the last frame of s' is in info.
             last = info["final_obs"][i] if ended[i] else x[i]
             s_next = (*s[i][1:], lz4.block.compress(last))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
@@ -668,7 +670,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         episodes, stops = sums.tolist()
         counters.episodes += episodes
         if rank > 0:
-            continue
+            continue  # the rest is number 0's
 
         games = info.get("final_info", {})
         for i in np.flatnonzero(games.get("_episode", ())):
@@ -712,7 +714,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         distributed.destroy_process_group()
     if stops:
         if rank == 0:
-            print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
+            print(f"frame {counters.frames:,}; go on with --resume {run_dir}")
         raise SystemExit(128 + (stop or [signal.SIGTERM])[0])
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
@@ -731,15 +733,14 @@ def main(args: Args) -> None:
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
     if ranks > 1:  # gloo on CPUs, NCCL on GPUs; the others wait while number 0 evaluates
-        distributed.init_process_group(timeout=datetime.timedelta(days=1))
+        distributed.init_process_group(timeout=datetime.timedelta(hours=1))
 
     # [seed, number] are the seeds of the evaluations.
-    seeds = np.random.SeedSequence([args.seed, 0, rank]).spawn(2 + args.num_simulators)
-    rngs = [np.random.default_rng(seed) for seed in seeds]
+    rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
     # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead.
     multiprocessing.set_forkserver_preload(["torch.utils.tensorboard", "gymnasium", "tyro"])
-    envs = AsyncVectorEnv(makers, context="spawn" if os.name == "nt" else "forkserver",
+    envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)
     try:
         learn(args, envs, rngs[:2], rank, ranks)
@@ -757,4 +758,7 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
-    main(read_args())
+    try:
+        main(read_args())
+    except OSError as error:  # TensorBoard's files, on a full disk
+        raise SystemExit(f"error: {error}") from None

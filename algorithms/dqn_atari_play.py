@@ -93,7 +93,8 @@ class Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3): `meanings`."""
+    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
+    `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -117,7 +118,7 @@ class NoOpReset(gym.Wrapper):
     def reset(self, **kwargs):
         screen, info = self.env.reset(**kwargs)
         for _ in range(self.rng.integers(self.no_op_max + 1)):
-            screen, _, _, _, info = self.env.step(0)
+            screen, _, _, _, info = self.env.step(0)  # NOOP
         return screen, info
 
 

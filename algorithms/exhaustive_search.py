@@ -39,7 +39,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V and rewards have one unit; an iteration is a sweep over a policy's states."""
+    """V and rewards have the same unit; an iteration is a sweep over a policy's states."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -67,8 +67,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it.
+# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
+#     sG has no row, no column, and V = 0.
 # R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
 # first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
 #     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
@@ -101,9 +102,9 @@ def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndar
     V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
     states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
     limits = args.discount, args.tolerance, args.max_iterations
-    V[states], changes = iterative_policy_evaluation(P_π, R_π, warm[states], *limits)
-    _, changes_from_0 = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
-    return V, len(changes), len(changes_from_0)
+    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, warm[states], *limits)
+    _, sweeps_from_0 = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
+    return V, sweeps, sweeps_from_0
 
 
 def exhaustive_search(P, R, first_row, start: np.ndarray, args: Args) -> tuple:
@@ -126,17 +127,16 @@ def exhaustive_search(P, R, first_row, start: np.ndarray, args: Args) -> tuple:
 
 
 def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
-    """Algorithm 1 from V (n,): V^π (n,), and the largest change in each sweep.
+    """Algorithm 1 from V (n,): V^π (n,), and the number of sweeps.
 
     P (n, n) and R (n,) are the policy's own. Exits if V has not converged after max_iterations.
     """
-    changes = []
-    for _ in tqdm(range(max_iterations), "policy evaluation", unit=" sweeps", delay=2, leave=False):
+    sweeps = range(1, max_iterations + 1)
+    for sweep in tqdm(sweeps, "policy evaluation", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + discount * (P @ V), V  # (n,)
-        changes.append(float(np.abs(V - V_old).max(initial=0)))
         if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
-            return V, changes
+            return V, sweep
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
@@ -172,28 +172,29 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
-    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+def read_model(args: Args) -> tuple[dict, gym.Env | None]:
+    """The model that the flags name, else Figure 5, and its environment, if it has one.
 
-    Exits with one line if there is none.
+    Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     items = [item.partition("=") for item in args.env_kwargs.split()]
-    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
-    model, start, grid = FIGURE_5, None, ()
+    values = {"true": True, "false": False}
+    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
+    model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
             env = gym.make(args.env_id, **kwargs).unwrapped
-            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
-            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
-        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
-        assert model, "no states"
+            model = env.P
+        model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
+        if not model:
+            raise ValueError("no state has an action")
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, np.eye(1, len(model))[0] if start is None else start, grid
+    return model, env
 
 
 def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -202,7 +203,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
+    rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
@@ -244,8 +245,9 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 
 def main(args: Args) -> None:
     """Try every policy of the MDP that the flags name, and report the best."""
-    model, start, _ = read_model(args)
+    model, env = read_model(args)
     P, R, first_row = arrays(model)
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,)
     policy, V, tried = exhaustive_search(P, R, first_row, start, args)
     for i, (value, sweeps, sweeps_from_0) in enumerate(tried[:10], start=1):
         print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")

@@ -20,7 +20,6 @@ Deviations
     and fro for ever.
 """
 
-import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ from scipy import optimize, sparse
 
 @dataclass
 class Args:
-    """V, Q and rewards have one unit; an iteration is one of the solver."""
+    """V, Q and rewards have the same unit; an iteration is one of the solver."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -58,8 +57,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it.
+# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
+#     sG has no row, no column, and V = 0.
 # R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
 # first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
 #     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
@@ -77,13 +77,13 @@ def linear_program(P, R, first_row: np.ndarray, discount: float) -> tuple[np.nda
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
     counts = np.diff(first_row, append=len(R))  # (S,) |A_s|
     E = sparse.eye_array(len(first_row), format="csr")[np.repeat(np.arange(len(counts)), counts)]
-    digits = float(np.clip(1e-16 * np.abs(R).max(), 1e-10, 1e-7))  # of a reward of 1e9, fewer
+    # float64 has 16 digits: beside a reward of 1e9, 1e-10 cannot be asked for.
+    digits = float(np.clip(1e-16 * np.abs(R).max(), 1e-10, 1e-7))
     tolerances = {"primal_feasibility_tolerance": digits, "dual_feasibility_tolerance": 1e-10}
-    # Easy to get wrong: who may stay for nothing has V ≥ 0; at discount 1 no constraint says so.
-    idle, before = np.ones(len(counts), bool), None  # (S,)
-    while not np.array_equal(idle, before):
-        idle, before = maximum((np.abs(R) <= 1e-9) & (P @ ~idle <= 0), first_row), idle
-    bounds = np.stack([np.where(idle, 0, -np.inf), np.full(len(counts), np.inf)], axis=1)  # (S, 2)
+    # Easy to get wrong: where the agent may stay for nothing V ≥ 0. At discount 1 its constraint,
+    # V(s) ≥ V(s), does not say so.
+    idle = np.maximum.reduceat(idle_rows(P, R, first_row, np.zeros(len(counts))), first_row)  # (S,)
+    bounds = [(0 if rests else None, None) for rests in idle]  # (S, 2)
     program = optimize.linprog(
         np.ones(len(counts)), discount * P - E, -R, bounds=bounds, options=tolerances
     )
@@ -98,57 +98,59 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return R + discount * (P @ V)  # (rows,)
 
 
-def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
-    """max_a Q(s, a): (rows,) → (S,)."""
-    width, rest = divmod(len(Q), len(first_row))
-    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():  # |A_s| is the same
-        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
-    return np.maximum.reduceat(Q, first_row)  # (S,)
-
-
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
-    tie, π takes one that ends soonest."""
+    tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = np.maximum.reduceat(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.995^steps to the end, or to where V stays 0.
-    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) without the rounding errors of sums to 1
-    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, ends)  # (rows,)
+    # tied actions take the one with most 0.995^steps to the end, or to where it rests.
+    idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.995 * (end + P @ near), -1)  # (rows,)
-        near, before = maximum(nearness, first_row), near  # (S,)
+        nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
+        near, before = np.maximum.reduceat(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
     return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
+
+
+def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """(rows,) bool: idle actions, after which the agent may go on for ever, or end, without any
+    reward. They lead only to states where V (S,) is 0 and some action is idle again."""
+    idle, before = np.abs(V) <= 1e-9, None  # (S,)
+    while not np.array_equal(idle, before):
+        rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
+        idle, before = idle & np.maximum.reduceat(rows, first_row), idle
+    return rows
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
-    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+def read_model(args: Args) -> tuple[dict, gym.Env | None]:
+    """The model that the flags name, else Figure 5, and its environment, if it has one.
 
-    Exits with one line if there is none.
+    Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     items = [item.partition("=") for item in args.env_kwargs.split()]
-    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
-    model, start, grid = FIGURE_5, None, ()
+    values = {"true": True, "false": False}
+    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
+    model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
             env = gym.make(args.env_id, **kwargs).unwrapped
-            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
-            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
-        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
-        assert model, "no states"
+            model = env.P
+        model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
+        if not model:
+            raise ValueError("no state has an action")
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, np.eye(1, len(model))[0] if start is None else start, grid
+    return model, env
 
 
 def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -157,7 +159,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
+    rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
@@ -206,7 +208,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 
 def main(args: Args) -> None:
     """Solve the MDP that the flags name, and report."""
-    model, _, _ = read_model(args)
+    model, _ = read_model(args)
     P, R, first_row = arrays(model)
     V, iterations = linear_program(P, R, first_row, args.discount)
     Q = backup(P, R, V, args.discount)  # (rows,)
@@ -218,7 +220,7 @@ def main(args: Args) -> None:
                 print(f"V({s}) ≥ {worked(transitions, args.discount, unknowns)}")
         print()
     policy, _ = greedy_policy(P, R, first_row, Q)
-    residual = np.abs(maximum(Q, first_row) - V).max()
+    residual = np.abs(np.maximum.reduceat(Q, first_row) - V).max()
     report(args.output_json, model, V, Q, policy, iterations, residual)
 
 

@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V and rewards have one unit; an iteration is a sweep over all states."""
+    """V and rewards have the same unit; an iteration is a sweep over all states."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -69,8 +69,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it.
+# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
+#     sG has no row, no column, and V = 0.
 # R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
 # first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
 #     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
@@ -80,17 +81,16 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 
 
 def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
-    """Algorithm 1 from V (n,): V^π (n,), and the largest change in each sweep.
+    """Algorithm 1 from V (n,): V^π (n,), and the number of sweeps.
 
     P (n, n) and R (n,) are the policy's own. Exits if V has not converged after max_iterations.
     """
-    changes = []
-    for _ in tqdm(range(max_iterations), "policy evaluation", unit=" sweeps", delay=2, leave=False):
+    sweeps = range(1, max_iterations + 1)
+    for sweep in tqdm(sweeps, "policy evaluation", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + discount * (P @ V), V  # (n,)
-        changes.append(float(np.abs(V - V_old).max(initial=0)))
         if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
-            return V, changes
+            return V, sweep
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
@@ -99,9 +99,9 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
     if len(R) > 1000:  # a factorization of a random graph fills in; this needs A @ V alone
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
-        if np.abs(A @ V - R).max() <= 1e-10 * max(1.0, np.abs(V).max()):
+        if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R)  # (n,)
+    return linalg.spsolve(A, R) if len(R) else R  # (n,)
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
@@ -136,28 +136,29 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
-    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+def read_model(args: Args) -> tuple[dict, gym.Env | None]:
+    """The model that the flags name, else Figure 5, and its environment, if it has one.
 
-    Exits with one line if there is none.
+    Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     items = [item.partition("=") for item in args.env_kwargs.split()]
-    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
-    model, start, grid = FIGURE_5, None, ()
+    values = {"true": True, "false": False}
+    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
+    model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
             env = gym.make(args.env_id, **kwargs).unwrapped
-            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
-            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
-        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
-        assert model, "no states"
+            model = env.P
+        model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
+        if not model:
+            raise ValueError("no state has an action")
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, np.eye(1, len(model))[0] if start is None else start, grid
+    return model, env
 
 
 def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -166,7 +167,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
+    rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
@@ -185,14 +186,11 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int, a row for each state, from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    policy = np.full(len(model), -1)
-    places = [(i, f"{s}={a}") for i, s in enumerate(model) for a in model[s]]  # of every row
-    if unknown := set(text.split()) - {name for _, name in places}:
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}
+    rows = {pair: row for row, pair in enumerate((s, a) for s in model for a in model[s])}
+    if unknown := chosen.items() - rows.keys():
         raise SystemExit(f"error: {unknown} names no state and action of this model")
-    for row, (state, name) in enumerate(places):
-        if name in text.split():
-            policy[state] = row
-    return policy
+    return np.array([rows[s, chosen[s]] if s in chosen else -1 for s in model])
 
 
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
@@ -230,24 +228,25 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
-def print_evaluation(model: dict, states, policy, discount: float, exact, sweeps: int) -> None:
-    """Equation 3 of the `states` (n,) that π (S,) reaches, its solution (n,), and the lecture's
-    table of the sweeps."""
-    names = [list(model)[s] for s in states]
+def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: int) -> None:
+    """Equation 3 of the states that π (S,) reaches, its solution (S,), and the lecture's table of
+    the sweeps."""
     rows = [transitions for actions in model.values() for transitions in actions.values()]
-    chosen = [rows[row] for row in policy[states]]
+    chosen = {s: rows[row] for s, row in zip(model, policy, strict=True) if row >= 0}
     unknowns = {s: f"V({s})" for s in model}
-    for s, transitions, v in zip(names, chosen, exact, strict=True):
-        fraction = Fraction(v).limit_denominator(1_000_000)
-        print(f"V({s}) = {worked(transitions, discount, unknowns)} = {fraction}")
+    for s, v in zip(model, exact, strict=True):
+        if s in chosen:
+            fraction = Fraction(v).limit_denominator(1_000_000)
+            text = fraction if np.isclose(float(fraction), v, rtol=1e-12, atol=0) else f"{v:.12g}"
+            print(f"V({s}) = {worked(chosen[s], discount, unknowns)} = {text}")
     print()
-    table, V = [["0"] * len(names)], np.zeros(len(model))  # (S,)
-    for _ in range(min(sweeps, 9)):
+    table, V = [["0"] * len(chosen)], np.zeros(len(model))  # (S,)
+    for _ in range(min(sweeps, 9)):  # once more, to be printed
         texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
-        V[states] = backup(*arrays(model)[:2], V, discount)[policy[states]]
-        cells = zip(chosen, V[states], strict=True)
-        table.append([f"{worked(t, discount, texts)} = {round(v, 2):g}" for t, v in cells])
-    print_table([f"V_i({s})" for s in names], table)
+        V = np.where(policy >= 0, backup(P, R, V, discount)[policy], 0)  # (S,)
+        cells = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
+        table.append([f"{worked(chosen[s], discount, texts)} = {cells[s]}" for s in chosen])
+    print_table([f"V_i({s})" for s in chosen], table)
 
 
 # ---- main ----------------------------------------------------------------------------------------
@@ -255,14 +254,16 @@ def print_evaluation(model: dict, states, policy, discount: float, exact, sweeps
 
 def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
-    model, start, _ = read_model(args)
+    model, env = read_model(args)
     P, R, first_row = arrays(model)
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,)
     lecture = ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]  # π1, π2, π3 of §3.2
     for text in [args.policy] if args.policy or args.model or args.env_id else lecture:
         policy = read_policy(text, model) if text else first_row  # (S,)
-        known = sparse.diags_array((policy >= 0).astype(float))  # (S, S)
-        reached = may_reach((known @ P[policy]).T, start > 0)  # (S,) the policy graph
-        if (policy[reached] < 0).any():
+        # The policy graph (§3.2): what may be reached from the start, so P is transposed. A row of
+        # -1 is the last of P; if its state is reached, that is an error anyway.
+        reached = may_reach(P[policy].T, start > 0)  # (S,)
+        if policy[reached].min() < 0:
             raise SystemExit("error: --policy comes to a state for which it names no action")
         policy, states = np.where(reached, policy, -1), np.flatnonzero(reached)  # (S,), (n,)
         P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
@@ -270,14 +271,14 @@ def main(args: Args) -> None:
         P_π, R_π = P_π[live][:, live], R_π[live]
         limits = args.discount, args.tolerance, args.max_iterations
         V = np.where(reached, 0.0, np.nan)  # (S,)
-        V[states[live]], changes = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
+        V[states[live]], sweeps = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
         exact = V.copy()  # (S,)
         exact[states[live]] = solve_system(P_π, R_π, args.discount)
         if len(R) <= 12:  # small enough to be worked through on paper
-            print_evaluation(model, states, policy, args.discount, exact[states], len(changes))
+            print_evaluation(model, P, R, policy, args.discount, exact, sweeps)
         Q = backup(P, R, V, args.discount)  # (rows,)
         residual = np.abs(Q[policy[states]] - V[states]).max()
-        report(args.output_json, model, V, Q, policy, len(changes), residual)
+        report(args.output_json, model, V, Q, policy, sweeps, residual)
         print(f"The linear system differs by {np.abs(V - exact)[states].max():.2g}\n")
 
 

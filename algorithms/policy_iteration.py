@@ -17,12 +17,11 @@ Measured
 
 Deviations
     An action is changed only for a gain: of actions that tie, an argmax may change for ever.
-    Not a random policy but, without --initial-policy, one that may end from everywhere: at discount
-    1 another has no value. From there a loop without rewards that never ends is not looked for.
+    Not a random policy but, without --initial-policy, one that ends or rests where it can: at
+    discount 1 another has no value.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
-import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -40,7 +39,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V, Q and rewards have one unit; an iteration evaluates and improves a policy."""
+    """V, Q and rewards have the same unit; an iteration evaluates and improves a policy."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -66,8 +65,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it.
+# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
+#     sG has no row, no column, and V = 0.
 # R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
 # first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
 #     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
@@ -80,14 +80,6 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     """Q (rows,) of the values V (S,)."""
     # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
     return R + discount * (P @ V)  # (rows,)
-
-
-def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
-    """max_a Q(s, a): (rows,) → (S,)."""
-    width, rest = divmod(len(Q), len(first_row))
-    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():  # |A_s| is the same
-        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
-    return np.maximum.reduceat(Q, first_row)  # (S,)
 
 
 def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=1000) -> list[tuple]:
@@ -104,12 +96,12 @@ def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=10
         Q = backup(P, R, V, discount)  # (rows,)
         steps.append((policy, V, Q))
         # π(s) = argmax_a Q^π(s, a)  Algorithm 4, line 5
-        best = maximum(Q, first_row)  # (S,)
+        best = np.maximum.reduceat(Q, first_row)  # (S,)
         gain = ~np.isclose(Q[policy], best, rtol=1e-9, atol=1e-9)  # (S,)
-        # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
-        policy = np.where(gain, greedy_policy(P, R, first_row, Q)[0], policy)
         if not gain.any():
             return steps
+        # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
+        policy = np.where(gain, greedy_policy(P, R, first_row, Q)[0], policy)
     raise SystemExit(f"error: π has not converged in {max_iterations} iterations")
 
 
@@ -118,9 +110,9 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
     if len(R) > 1000:  # a factorization of a random graph fills in; this needs A @ V alone
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
-        if np.abs(A @ V - R).max() <= 1e-10 * max(1.0, np.abs(V).max()):
+        if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R)  # (n,)
+    return linalg.spsolve(A, R) if len(R) else R  # (n,)
 
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
@@ -148,47 +140,57 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
 
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
-    tie, π takes one that ends soonest."""
+    tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = np.maximum.reduceat(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.995^steps to the end, or to where V stays 0.
-    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) without the rounding errors of sums to 1
-    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, ends)  # (rows,)
+    # tied actions take the one with most 0.995^steps to the end, or to where it rests.
+    idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.995 * (end + P @ near), -1)  # (rows,)
-        near, before = maximum(nearness, first_row), near  # (S,)
+        nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
+        near, before = np.maximum.reduceat(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
     return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
+
+
+def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """(rows,) bool: idle actions, after which the agent may go on for ever, or end, without any
+    reward. They lead only to states where V (S,) is 0 and some action is idle again."""
+    idle, before = np.abs(V) <= 1e-9, None  # (S,)
+    while not np.array_equal(idle, before):
+        rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
+        idle, before = idle & np.maximum.reduceat(rows, first_row), idle
+    return rows
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
-    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+def read_model(args: Args) -> tuple[dict, gym.Env | None]:
+    """The model that the flags name, else Figure 5, and its environment, if it has one.
 
-    Exits with one line if there is none.
+    Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     items = [item.partition("=") for item in args.env_kwargs.split()]
-    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
-    model, start, grid = FIGURE_5, None, ()
+    values = {"true": True, "false": False}
+    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
+    model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
             env = gym.make(args.env_id, **kwargs).unwrapped
-            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
-            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
-        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
-        assert model, "no states"
+            model = env.P
+        model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
+        if not model:
+            raise ValueError("no state has an action")
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, np.eye(1, len(model))[0] if start is None else start, grid
+    return model, env
 
 
 def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -197,7 +199,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
+    rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
@@ -216,14 +218,11 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int, a row for each state, from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    policy = np.full(len(model), -1)
-    places = [(i, f"{s}={a}") for i, s in enumerate(model) for a in model[s]]  # of every row
-    if unknown := set(text.split()) - {name for _, name in places}:
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}
+    rows = {pair: row for row, pair in enumerate((s, a) for s in model for a in model[s])}
+    if unknown := chosen.items() - rows.keys():
         raise SystemExit(f"error: {unknown} names no state and action of this model")
-    for row, (state, name) in enumerate(places):
-        if name in text.split():
-            policy[state] = row
-    return policy
+    return np.array([rows[s, chosen[s]] if s in chosen else -1 for s in model])
 
 
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
@@ -273,12 +272,16 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 
 def main(args: Args) -> None:
     """Improve the policy that the flags name until it is the best, and report."""
-    model, _, _ = read_model(args)
+    model, _ = read_model(args)
     P, R, first_row = arrays(model)
-    lecture = "" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1"  # π2 of §3.2
-    policy, _ = greedy_policy(P, 1 + 0 * R, first_row, 0 * R)  # (S,) all tie: it ends soonest
-    if args.initial_policy or lecture:
-        policy = read_policy(args.initial_policy or lecture, model)  # (S,)
+    text = args.initial_policy or ("" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1")  # π2
+    if text:
+        policy = read_policy(text, model)  # (S,)
+    else:
+        # Easy to get wrong: at discount 1 the first policy needs a value. It rests where that costs
+        # nothing, else it takes the shortest way to such a state or to the end.
+        idle = idle_rows(P, R, first_row, np.zeros(len(model)))  # (rows,)
+        policy, _ = greedy_policy(P, R, first_row, idle - 1.0)  # as Q: 0 where idle, else -1
     if policy.min() < 0:
         raise SystemExit("error: --initial-policy needs an action in every state")
     steps = policy_iteration(P, R, first_row, policy, args.discount, args.max_iterations)
@@ -291,7 +294,7 @@ def main(args: Args) -> None:
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], rows)
         names = [a for s in model for a in model[s]]  # of every row
         print_table([f"π_i({s})" for s in model], [[names[row] for row in π] for π, _, _ in shown])
-    residual = np.abs(maximum(Q, first_row) - V).max()
+    residual = np.abs(np.maximum.reduceat(Q, first_row) - V).max()
     report(args.output_json, model, V, Q, policy, len(steps), residual)
 
 

@@ -20,10 +20,10 @@ Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
     Of actions that tie, the policy takes one that ends soonest: at discount 1 an argmax may walk to
     and fro for ever.
-    A terminal state has V = 0, no row and no column.
+    A transition that terminates adds no V(s'): a terminal state needs no entry in a model. Where
+    one of Gymnasium's has an entry, its V means nothing.
 """
 
-import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V, Q and rewards have one unit; an iteration is a sweep over all states."""
+    """V, Q and rewards have the same unit; an iteration is a sweep over all states."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -69,8 +69,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S) CSR: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it.
+# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
+#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
+#     sG has no row, no column, and V = 0.
 # R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
 # first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
 #     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
@@ -85,75 +86,77 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return R + discount * (P @ V)  # (rows,)
 
 
-def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
-    """max_a Q(s, a): (rows,) → (S,)."""
-    width, rest = divmod(len(Q), len(first_row))
-    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():  # |A_s| is the same
-        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,) column by column
-    return np.maximum.reduceat(Q, first_row)  # (S,)
-
-
 def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
     """Algorithm 3: V* (S,), Q* (rows,), and the largest change of V in each sweep.
 
-    Exits if V has not converged after max_iterations.
+    Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
     """
     V, changes, converged = np.zeros(len(first_row)), [], False  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         Q = backup(P, R, V, discount)  # (rows,)
-        V, V_old = maximum(Q, first_row), V  # (S,)
+        V, V_old = np.maximum.reduceat(Q, first_row), V  # (S,) the maximum of each state's rows
         change = np.abs(V - V_old)  # (S,)
         changes.append(float(change.max()))
-        if converged:  # Q is a step behind V: it takes one sweep more after V has converged
+        if converged:  # one sweep more, i = 5 in the lecture's table: now Q is that of V*
             return V, Q, changes
         converged = (change <= tolerance * np.maximum(1, np.abs(V))).all()
-    raise SystemExit(f"error: V has not converged in {max_iterations} sweeps; V* may be infinite")
+    raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
-    tie, π takes one that ends soonest."""
+    tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = np.maximum.reduceat(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.995^steps to the end, or to where V stays 0.
-    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) without the rounding errors of sums to 1
-    end = np.where((np.abs(R) <= 1e-9) & (P @ np.abs(V) <= 1e-9), 1, ends)  # (rows,)
+    # tied actions take the one with most 0.995^steps to the end, or to where it rests.
+    idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.995 * (end + P @ near), -1)  # (rows,)
-        near, before = maximum(nearness, first_row), near  # (S,)
+        nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
+        near, before = np.maximum.reduceat(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
     return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
+
+
+def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """(rows,) bool: idle actions, after which the agent may go on for ever, or end, without any
+    reward. They lead only to states where V (S,) is 0 and some action is idle again."""
+    idle, before = np.abs(V) <= 1e-9, None  # (S,)
+    while not np.array_equal(idle, before):
+        rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
+        idle, before = idle & np.maximum.reduceat(rows, first_row), idle
+    return rows
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, np.ndarray, tuple]:
-    """The model that the flags name, else Figure 5; P(start) (S,); the shape of a grid world.
+def read_model(args: Args) -> tuple[dict, gym.Env | None]:
+    """The model that the flags name, else Figure 5, and its environment, if it has one.
 
-    Exits with one line if there is none.
+    Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     items = [item.partition("=") for item in args.env_kwargs.split()]
-    kwargs = {name: {"True": True, "False": False}.get(text, text) for name, _, text in items}
-    model, start, grid = FIGURE_5, None, ()
+    values = {"true": True, "false": False}
+    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
+    model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
             env = gym.make(args.env_id, **kwargs).unwrapped
-            model, start = env.P, getattr(env, "initial_state_distrib", None)  # (S,)
-            grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))
-        model = {str(s): {str(a): t for a, t in actions.items()} for s, actions in model.items()}
-        assert model, "no states"
+            model = env.P
+        model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
+        if not model:
+            raise ValueError("no state has an action")
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, np.eye(1, len(model))[0] if start is None else start, grid
+    return model, env
 
 
 def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
@@ -162,7 +165,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     Exits with one line if a state and action make no sense.
     """
     number = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in (model[s] or {"none": []}).items()]
+    rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
@@ -226,8 +229,8 @@ def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> 
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(range(1, len(changes) + 1), changes, marker=".")
-    left.set(xlabel="iteration", ylabel="max |V_i - V_i-1|")
-    left.set_yscale("log" if max(changes) > 0 else "linear")
+    scale = "log" if any(changes) else "linear"
+    left.set(xlabel="iteration", ylabel="max |V_i - V_i-1|", yscale=scale)
     if len(grid) == 2 and np.prod(grid) == len(V):
         place = np.stack(np.divmod(np.arange(len(V)), grid[1])[::-1], axis=1)  # (S, 2) x, y
         step = P @ place - P.sum(axis=1)[:, None] * np.repeat(place, P.shape[0] // len(V), axis=0)
@@ -238,9 +241,11 @@ def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> 
         image = right.imshow(np.where(acts, V, np.nan).reshape(grid))
         figure.colorbar(image, label="V(s)", shrink=0.8)
         u, v = arrow[policy[acts] % len(arrow)].T  # (cells,) each
-        scale = 2 * np.abs(arrow).max()  # the longest arrow is half a cell
-        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=scale)
+        cell = 2 * np.abs(arrow).max()  # the longest arrow is half a cell
+        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=cell)
         right.set(title="V and π")
+    else:
+        right.set_axis_off()
     figure.savefig(path, format="png", dpi=120)
 
 
@@ -249,18 +254,20 @@ def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> 
 
 def main(args: Args) -> None:
     """Solve the MDP that the flags name, and report."""
-    model, _, grid = read_model(args)
+    model, env = read_model(args)
+    grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))  # CliffWalking, FrozenLake
     P, R, first_row = mdp = arrays(model)
     V, Q, changes = value_iteration(*mdp, args.discount, args.tolerance, args.max_iterations)
     policy, ends = greedy_policy(P, R, first_row, Q)
+    # A loop whose rewards cancel (+1, -1, +1, …) can hold V above what any policy gets.
     if args.discount == 1 and (np.abs(V[~ends]) > 1e-9).any():
-        raise SystemExit("error: V has converged to more than any policy gets: it walks in a loop")
+        raise SystemExit("error: V* is not found: there is a loop without end, and without reward")
     if len(R) <= 12:  # small enough to be worked through on paper
         values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]  # V_0, V_1, ... once more
         for _ in changes[:9]:
             Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
-            values.append(maximum(Q_i, first_row))  # (S,)
+            values.append(np.maximum.reduceat(Q_i, first_row))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
     report(args.output_json, model, V, Q, policy, len(changes), changes[-1])

@@ -1,14 +1,16 @@
-"""Frames per second of dqn_atari.py beside Stable-Baselines3's DQN, and where a frame's time goes.
+"""Frames per second of the DQN scripts beside Stable-Baselines3's, and where a frame's time goes.
 
     pip install -r requirements.txt -r benchmarks/requirements.txt
-    python benchmarks/dqn_throughput.py
+    python benchmarks/dqn_throughput.py                 # dqn_atari.py, at both replay ratios
+    python benchmarks/dqn_throughput.py --parallel      # dqn_atari_parallel.py, 1 to 8 simulators
 
 The same game, minibatch of 32, replay ratio, learning rate and interval of target copies, ε at
 0.01, timed once learning is under way, on an otherwise idle machine. The contenders run in
-processes of their own that take turns, 100 frames each while the others wait: all see the same
-machine, whose speed may drift. dqn_atari.py is run whole, as its users run it, in float32 and in
-what its --precision auto chooses; Stable-Baselines3's DQN with its CnnPolicy and its own Atari
-wrappers. All are on the CPU and warm up for 1,000 frames without learning and 1,000 with.
+processes of their own that take turns, 96 frames each while the others wait: all see the same
+machine, whose speed may drift. Our scripts are run whole, as their users run them;
+Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
+as there are simulators. All are on the CPU and warm up for 1,000 frames without learning and 1,000
+with.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
 when it is old: moments of half of its units denormal, with and without the flag that flushes
@@ -32,16 +34,18 @@ import torch
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
-WARM_UP = 2_000  # frames: 1,000 without learning, 1,000 with
-TURN = 100  # frames
+TURN = 96  # frames: whole steps of 1, 2, 4 and 8 simulators
+WARM_UP = 21 * TURN  # frames, about half of them with learning
 
 
 @dataclasses.dataclass
 class Args:
     frames: int = 2_000
-    """frames of each contender that are timed, at one update a frame and at one in four"""
+    """frames of each contender that are timed, in whole turns of 96"""
     env_id: str = "PongNoFrameskip-v4"
     """game"""
+    parallel: bool = False
+    """whether to time dqn_atari_parallel.py, at one update in four"""
 
 
 class Turns:
@@ -54,9 +58,9 @@ class Turns:
         mine.acquire()
         self.started = time.perf_counter()
 
-    def frame(self) -> None:
-        """To be called after every frame."""
-        self.frames += 1
+    def step(self, frames: int = 1) -> None:
+        """To be called after every frame, or after those of several simulators."""
+        self.frames += frames
         if self.frames % TURN == 0:
             if self.frames > WARM_UP:
                 self.seconds.append(time.perf_counter() - self.started)
@@ -65,26 +69,47 @@ class Turns:
             self.started = time.perf_counter()
 
 
-def ours(args: Args, update_frequency: int, turns: Turns, precision: str) -> None:
-    """Run dqn_atari.py; a frame is an update of its progress bar."""
-    import dqn_atari as dqn
+def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
+    """Run dqn_atari.py or dqn_atari_parallel.py; frames are updates of its progress bar."""
 
     class Bar(dqn.tqdm):
         def update(self, n=1):
             super().update(n)
-            turns.frame()
+            turns.step(n)
 
-    dqn.tqdm = Bar
+    if turns:
+        dqn.tqdm = Bar
     with tempfile.TemporaryDirectory() as folder:
         dqn.main(dqn.Args(
-            env_id=args.env_id, device="cpu", precision=precision, runs_dir=folder,
+            env_id=args.env_id, device="cpu", runs_dir=folder,
             environment_train_frames_max=WARM_UP + args.frames, agent_replay_buffer_initial=1000,
-            agent_update_frequency=update_frequency, agent_epsilon_greedy_annealing=1000,
-            environment_test_frames=1))
+            agent_epsilon_greedy_annealing=1000, environment_test_frames=1, **flags))
 
 
-def stable_baselines3(args: Args, update_frequency: int, turns: Turns, _precision: str) -> None:
-    """Run its DQN; a frame is a call of its callback."""
+def ours(args: Args, turns: Turns, **flags) -> None:
+    """dqn_atari.py."""
+    import dqn_atari
+
+    run_script(dqn_atari, args, turns, **flags)
+
+
+def ours_parallel(args: Args, turns: Turns | None, ranks: int, rank: int = 0, **flags) -> None:
+    """dqn_atari_parallel.py, in `ranks` processes as torchrun starts them."""
+    import dqn_atari_parallel
+
+    if ranks > 1:
+        os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(ranks), "MASTER_ADDR": "127.0.0.1",
+                       "MASTER_PORT": "29876"}
+        if rank == 0:
+            others = {"ranks": ranks, "rank": 1, **flags}
+            multiprocessing.get_context("spawn").Process(
+                target=ours_parallel, args=(args, None), kwargs=others).start()
+        torch.set_num_threads(1)  # as torchrun does
+    run_script(dqn_atari_parallel, args, turns, **flags)
+
+
+def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1) -> None:
+    """Run its DQN; a call of its callback is a frame of each environment."""
     import ale_py
     import gymnasium as gym
     from stable_baselines3 import DQN
@@ -94,47 +119,42 @@ def stable_baselines3(args: Args, update_frequency: int, turns: Turns, _precisio
 
     class Clock(BaseCallback):
         def _on_step(self) -> bool:
-            turns.frame()
+            turns.step(envs)
             return True
 
     gym.register_envs(ale_py)
     same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
-    env = make_atari_env(args.env_id, n_envs=1, seed=1, env_kwargs=same_game)
+    env = make_atari_env(args.env_id, n_envs=envs, seed=1, env_kwargs=same_game)
     frames = WARM_UP + args.frames
     model = DQN("CnnPolicy", VecFrameStack(env, n_stack=4), learning_rate=1e-4, buffer_size=frames,
-                learning_starts=1000, batch_size=32, train_freq=update_frequency, gradient_steps=1,
-                target_update_interval=1000, exploration_fraction=1000 / frames,
-                exploration_final_eps=0.01, seed=1, device="cpu")
+                learning_starts=1000, batch_size=32, target_update_interval=1000,
+                train_freq=max(1, agent_update_frequency // envs),
+                gradient_steps=max(1, envs // agent_update_frequency),
+                exploration_fraction=1000 / frames, exploration_final_eps=0.01, seed=1,
+                device="cpu")
     model.learn(frames, callback=Clock())
 
 
-CONTENDERS = {
-    "Stable-Baselines3": (stable_baselines3, ""),
-    "dqn_atari.py, float32": (ours, "float32"),
-    "dqn_atari.py, auto": (ours, "auto"),
-}
-
-
-def run(name: str, args: Args, update_frequency: int, mine, following, results) -> None:
+def run(name: str, contender: tuple, args: Args, mine, following, results) -> None:
     """What the process of a contender does."""
+    function, flags = contender
     turns = Turns(mine, following)
     with open(os.devnull, "w") as nowhere:
         with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
-            who, precision = CONTENDERS[name]
-            who(args, update_frequency, turns, precision)
+            function(args, turns, **flags)
     results.put((name, turns.seconds[: args.frames // TURN]))
     following.release()  # all turns are over: the next may end, too
 
 
-def side_by_side(args: Args, update_frequency: int) -> dict[str, np.ndarray]:
-    """Seconds of every turn of each contender."""
+def side_by_side(args: Args, contenders: dict[str, tuple]) -> dict[str, float]:
+    """Frames per second of each contender."""
     spawn = multiprocessing.get_context("spawn")
     results = spawn.Queue()
-    ring = [spawn.Semaphore(int(i == 0)) for i in range(len(CONTENDERS))]
+    ring = [spawn.Semaphore(int(i == 0)) for i in range(len(contenders))]
     children = [
-        spawn.Process(target=run, daemon=True, args=(
-            name, args, update_frequency, ring[i], ring[(i + 1) % len(ring)], results))
-        for i, name in enumerate(CONTENDERS)
+        spawn.Process(target=run, args=(
+            name, contender, args, ring[i], ring[(i + 1) % len(ring)], results))
+        for i, (name, contender) in enumerate(contenders.items())
     ]
     for child in children:
         child.start()
@@ -142,8 +162,10 @@ def side_by_side(args: Args, update_frequency: int) -> dict[str, np.ndarray]:
     while len(found) < len(children):
         with contextlib.suppress(queue.Empty):
             name, seconds = results.get(timeout=1)
-            found[name] = np.array(seconds)
+            found[name] = TURN / np.mean(seconds)
         if any(child.exitcode for child in children):  # the others would wait for it for ever
+            for child in children:
+                child.kill()
             raise SystemExit("error: a contender has failed")
     for child in children:
         child.join()
@@ -251,23 +273,71 @@ def flushed_parts(args: Args) -> dict[str, float]:
     return parts(args)
 
 
+def choose_precision() -> str:
+    """What dqn_atari.py --precision auto chooses here."""
+    import dqn_atari
+
+    torch.set_flush_denormal(True)
+    return dqn_atari.choose_precision(dqn_atari.Args(device="cpu"))
+
+
+def compare_replay_ratios(args: Args) -> None:
+    """Stable-Baselines3 and dqn_atari.py, at one update a frame and at one in four."""
+    columns = []
+    for frequency in (1, 4):
+        same = {"agent_update_frequency": frequency}
+        columns.append(side_by_side(args, {
+            "Stable-Baselines3": (stable_baselines3, same),
+            "dqn_atari.py, float32": (ours, same | {"precision": "float32"}),
+            "dqn_atari.py, auto": (ours, same | {"precision": "auto"}),
+        }))
+    title = ("update every frame", "update every 4th")
+    print(f"\n{'frames a second':<38}{title[0]:>22}{title[1]:>22}")
+    for name in columns[0]:
+        rates = [f"{c[name]:.1f} ({c[name] / c['Stable-Baselines3']:.2f})" for c in columns]
+        print(f"{name:<38}{rates[0]:>22}{rates[1]:>22}")
+
+
+def compare_simulators(args: Args, times: dict[str, float]) -> None:
+    """dqn_atari_parallel.py with 1 to 8 simulators, and with two processes of 4."""
+    precision = in_a_process(choose_precision)
+    same = {"agent_update_frequency": 4}
+    chosen = same | {"precision": precision}
+    contenders = {"dqn_atari.py": (ours, chosen)}
+    for n in (1, 2, 4, 8):
+        flags = chosen | {"num_simulators": n, "ranks": 1}
+        contenders[f"dqn_atari_parallel.py, {n} simulators"] = (ours_parallel, flags)
+        contenders[f"Stable-Baselines3, {n} environments"] = (stable_baselines3, same | {"envs": n})
+    flags = chosen | {"num_simulators": 4, "ranks": 2}
+    contenders["dqn_atari_parallel.py, 2 ranks of 4"] = (ours_parallel, flags)
+    found = side_by_side(args, contenders)
+    title = "update every 4th frame"
+    print(f"\n{'frames a second, ' + precision:<38}{title:>28}")
+    for name in contenders:
+        print(f"{name:<38}{found[name]:>19.1f} ({found[name] / found['dqn_atari.py']:.2f})")
+    parts = {"emulation": sum(list(times.values())[:2]), "acting": times["act"],
+             "learning": (times["sample"] + times[f"update, {precision}"]) / 4}
+    shares = [f"{name} {ms / sum(parts.values()):.0%}" for name, ms in parts.items()]
+    print(f"of a frame of dqn_atari.py: {', '.join(shares)}")
+    print(f"extrapolated: with cores enough for the simulators and acting, learning alone is left: "
+          f"{1000 / parts['learning']:.0f} frames a second")
+
+
 def main(args: Args) -> None:
     """Print where a frame's time goes, then the contenders side by side."""
     import stable_baselines3  # noqa: F401  it is wanted later: its absence is to be known now
 
+    args.frames = max(1, args.frames // TURN) * TURN
     print(f"{args.env_id}; {cpu_name()}, {os.cpu_count()} cores; PyTorch {torch.__version__}\n")
     print(f"{'milliseconds':<38}")
-    for name, value in in_a_process(flushed_parts, args).items():
+    times = in_a_process(flushed_parts, args)
+    for name, value in times.items():
         print(f"{name:<38}{value:>10.2f}", flush=True)
     print(f"{'  the same, denormals not flushed':<38}{in_a_process(old_without_flushing):>10.2f}")
-    columns = [side_by_side(args, frequency) for frequency in (1, 4)]
-    title = ("update every frame", "update every 4th")
-    print(f"\n{'frames a second':<38}{title[0]:>22}{title[1]:>22}")
-    for name in CONTENDERS:
-        print(f"{name:<38}" + "".join(f"{TURN / c[name].mean():>22.1f}" for c in columns))
-    for name in list(CONTENDERS)[1:]:
-        ratios = [c["Stable-Baselines3"].sum() / c[name].sum() for c in columns]
-        print(f"{'ratio, ' + name:<38}" + "".join(f"{ratio:>22.2f}" for ratio in ratios))
+    if args.parallel:
+        compare_simulators(args, times)
+    else:
+        compare_replay_ratios(args)
 
 
 if __name__ == "__main__":

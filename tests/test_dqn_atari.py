@@ -409,6 +409,8 @@ def test_update_in_bfloat16_is_close_to_float32():
         assert all(θ.dtype == θ.grad.dtype == torch.float32 for θ in q.parameters())
         results[precision] = values, torch.cat([θ.grad.flatten() for θ in q.parameters()])
     assert dtypes == [torch.float32, torch.bfloat16]
+    dqn.update(q, q, sgd, minibatch, 0.99, "bfloat16")  # without a target network
+    assert all(θ.grad.any() for θ in q.parameters())
     (q_32, gradient_32), (q_16, gradient_16) = results.values()
     assert torch.allclose(q_32, q_16, atol=0.02) and not torch.equal(q_32, q_16)
     assert torch.cosine_similarity(gradient_32, gradient_16, dim=0) > 0.99

@@ -252,7 +252,7 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     saved = read_checkpoint(run_dir)
     frames, updates = saved["counters"]["frames"], saved["counters"]["updates"]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", shlex.split(output.splitlines()[-1].split("python ")[1]))
+    monkeypatch.setattr(sys, "argv", shlex.split(output.splitlines()[-1])[4:])
     flags = vars(parallel.read_args()) | {"environment_train_frames_max": frames + 140}
     first = Run(run_dir.parent, **flags).updates[0]
     assert first["frames"] >= 100 and first["adam"] == updates + 1

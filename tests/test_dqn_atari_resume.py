@@ -158,7 +158,10 @@ def test_killed_and_resumed_is_never_stopped(straight, tmp_path):
 
 def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path):
     assert run(runs_dir=tmp_path, environment_train_frames_max=250) == 0
-    assert run("--resume", only(tmp_path), "--environment-train-frames-max", FRAMES) == 0
+    flags = "--resume", only(tmp_path), "--environment-train-frames-max", FRAMES
+    assert run(*flags, each_frame=stop_at(300, signal.SIGTERM)) == 143
+    assert not (only(tmp_path) / "test.json").exists()  # it was the shorter run's
+    assert run("--resume", only(tmp_path)) == 0
     assert everything(only(tmp_path)) == straight[1]
 
 
@@ -254,7 +257,9 @@ def test_damaged_and_mistaken_checkpoints_are_refused(stopped, tmp_path):
 def test_contradictions_are_refused(stopped):
     refused(stopped, "--seed", 3)
     refused(stopped, "--agent-discount-factor", 0.5, "--environment-train-frames-max", 900)
-    for text in ("{", "[1]", '{"steps": 1}'):
+    refused(stopped, "--environment-train-frames-max", FRAMES - 1)
+    parallel = json.loads((stopped / "args.json").read_text()) | {"num_simulators": 8}
+    for text in ("{", "[1]", '{"steps": 1}', json.dumps(parallel)):
         (stopped / "args.json").write_text(text)
         refused(stopped)
     (stopped / "args.json").unlink()
@@ -326,5 +331,6 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_is_in_no_checkpoint(
     code = run(runs_dir=tmp_path, each_frame=frames.append)
     saved = torch.load(only(tmp_path) / "checkpoint.pt", weights_only=True)
     assert saved["counters"]["frames"] == last
+    assert code.startswith("error: ") and "\n" not in code
+    assert not (only(tmp_path) / "test.json").exists()
     assert all(θ.isfinite().all() for θ in saved["q_network"].values())
-    assert frame == 455 or (isinstance(code, str) and "\n" not in code)
