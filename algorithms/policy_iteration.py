@@ -22,6 +22,7 @@ Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
+import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -82,6 +83,15 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return R + discount * (P @ V)  # (rows,)
 
 
+def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
+    """max_a Q(s, a): (rows,) → (S,)."""
+    width, rest = divmod(len(Q), len(first_row))
+    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():
+        # As many actions in every state: the same, by whole columns, is much quicker.
+        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,)
+    return np.maximum.reduceat(Q, first_row)  # (S,) the maximum of each state's rows
+
+
 def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=1000) -> list[tuple]:
     """Algorithm 4 from `policy` (S,) int, a row for each state: [(π (S,), V^π (S,), Q^π (rows,)),
     ...], of which the last is the best.
@@ -96,7 +106,7 @@ def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=10
         Q = backup(P, R, V, discount)  # (rows,)
         steps.append((policy, V, Q))
         # π(s) = argmax_a Q^π(s, a)  Algorithm 4, line 5
-        best = np.maximum.reduceat(Q, first_row)  # (S,)
+        best = maximum(Q, first_row)  # (S,)
         gain = ~np.isclose(Q[policy], best, rtol=1e-9, atol=1e-9)  # (S,)
         if not gain.any():
             return steps
@@ -142,7 +152,7 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
     tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = np.maximum.reduceat(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
     # tied actions take the one with most 0.995^steps to the end, or to where it rests.
@@ -150,7 +160,7 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
         nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
-        near, before = np.maximum.reduceat(nearness, first_row), near  # (S,)
+        near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
     return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
 
@@ -161,7 +171,7 @@ def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
     idle, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(idle, before):
         rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
-        idle, before = idle & np.maximum.reduceat(rows, first_row), idle
+        idle, before = idle & maximum(rows, first_row), idle
     return rows
 
 
@@ -294,7 +304,7 @@ def main(args: Args) -> None:
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], rows)
         names = [a for s in model for a in model[s]]  # of every row
         print_table([f"π_i({s})" for s in model], [[names[row] for row in π] for π, _, _ in shown])
-    residual = np.abs(np.maximum.reduceat(Q, first_row) - V).max()
+    residual = np.abs(maximum(Q, first_row) - V).max()
     report(args.output_json, model, V, Q, policy, len(steps), residual)
 
 

@@ -24,6 +24,7 @@ Deviations
     one of Gymnasium's has an entry, its V means nothing.
 """
 
+import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -86,6 +87,15 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return R + discount * (P @ V)  # (rows,)
 
 
+def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
+    """max_a Q(s, a): (rows,) → (S,)."""
+    width, rest = divmod(len(Q), len(first_row))
+    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():
+        # As many actions in every state: the same, by whole columns, is much quicker.
+        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,)
+    return np.maximum.reduceat(Q, first_row)  # (S,) the maximum of each state's rows
+
+
 def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
     """Algorithm 3: V* (S,), Q* (rows,), and the largest change of V in each sweep.
 
@@ -95,7 +105,7 @@ def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_itera
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         Q = backup(P, R, V, discount)  # (rows,)
-        V, V_old = np.maximum.reduceat(Q, first_row), V  # (S,) the maximum of each state's rows
+        V, V_old = maximum(Q, first_row), V  # (S,)
         change = np.abs(V - V_old)  # (S,)
         changes.append(float(change.max()))
         if converged:  # one sweep more, i = 5 in the lecture's table: now Q is that of V*
@@ -108,7 +118,7 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
     tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = np.maximum.reduceat(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
     # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
     # tied actions take the one with most 0.995^steps to the end, or to where it rests.
@@ -116,7 +126,7 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
         nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
-        near, before = np.maximum.reduceat(nearness, first_row), near  # (S,)
+        near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
     return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
 
@@ -127,7 +137,7 @@ def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
     idle, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(idle, before):
         rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
-        idle, before = idle & np.maximum.reduceat(rows, first_row), idle
+        idle, before = idle & maximum(rows, first_row), idle
     return rows
 
 
@@ -267,7 +277,7 @@ def main(args: Args) -> None:
         for _ in changes[:9]:
             Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
-            values.append(np.maximum.reduceat(Q_i, first_row))  # (S,)
+            values.append(maximum(Q_i, first_row))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
     report(args.output_json, model, V, Q, policy, len(changes), changes[-1])

@@ -68,7 +68,7 @@ def bellman_sweeps(size: int, number: int) -> list[float]:
     script = importlib.import_module("value_iteration")
     (P, R, first_row), ddp = our_mdp(size), their_mdp(size)
     V, V_next = np.random.default_rng(1).random(size), np.empty(size)
-    sweeps = (lambda: np.maximum.reduceat(script.backup(P, R, V, DISCOUNT), first_row),
+    sweeps = (lambda: script.maximum(script.backup(P, R, V, DISCOUNT), first_row),
               lambda: ddp.bellman_operator(V, Tv=V_next))  # fmt: skip
     seconds = [], []
     for turn in range(0, number, 10):
@@ -93,7 +93,7 @@ def our_solve(what: str, size: int) -> tuple[float, int, np.ndarray]:
         script.greedy_policy(P, R, first_row, Q)
         iterations = len(changes)
     elif what == "policy_iteration":  # from the greedy policy of max_a R(s, a), as QuantEcon does
-        Q = script.backup(P, R, np.maximum.reduceat(R, first_row), DISCOUNT)
+        Q = script.backup(P, R, script.maximum(R, first_row), DISCOUNT)
         policy, _ = script.greedy_policy(P, R, first_row, Q)
         steps = script.policy_iteration(P, R, first_row, policy, DISCOUNT)
         V, iterations = steps[-1][1], len(steps)

@@ -1,4 +1,4 @@
-"""dqn_atari_ablation.py: without its switches it is dqn_atari.py, and each switch does one thing."""
+"""dqn_atari_ablation.py: without its switches it is dqn_atari.py, each switch does one thing."""
 
 import csv
 import math
@@ -92,7 +92,8 @@ def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkey
     ends = [n for n in stored_when if n >= 200 and n % 4 == 0]  # past 300 the memory wraps
     assert len(calls) == len(ends)
     for (_, _, minibatch), end in zip(calls, ends, strict=True):
-        for column, expected in zip(minibatch, zip(*stored[end - 32 : end], strict=True), strict=True):
+        last = zip(*stored[end - 32 : end], strict=True)
+        for column, expected in zip(minibatch, last, strict=True):
             tensors = [torch.as_tensor(value) for value in expected]
             assert torch.equal(column, torch.stack(tensors).to(column.dtype))
 

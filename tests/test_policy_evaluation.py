@@ -79,7 +79,9 @@ class TestEveryScript:
         assert "here" in (line := refused(script, tmp_path, model)) and "this" in line
 
     def test_no_model(self, script, tmp_path):
-        assert "here" in refused(script, tmp_path, {"s": {"a": [go("goal")]}, "here": {}})
+        refused(script, tmp_path, {"s": {"a": [go("here")]}, "here": {}})
+        found = run(script, tmp_path, {"s": {"a": [go("goal")]}, "goal": {}})  # the lecture's s_G
+        assert found["values"] == {"s": 0}
         for text in ("", "{}", "[]", "[" * 100_000, '{"s": 3}'):
             refused(script, tmp_path, text)
 

@@ -44,7 +44,8 @@ def pinned() -> dict[str, str]:
     """requirements.txt: name and version; every line says why."""
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     assert all(re.fullmatch(r"[\w.-]+==\S+ +# \S.*", line) for line in lines), lines
-    return {name.lower(): version for name, version in (line.split()[0].split("==") for line in lines)}
+    pairs = (line.split()[0].split("==") for line in lines)
+    return {name.lower(): version for name, version in pairs}
 
 
 def test_same_name_same_source():
