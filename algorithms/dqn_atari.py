@@ -23,6 +23,11 @@ Run it
         --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \
         --optimizer-q-network-parameter-update-interval-frames 40000
 
+Measured, on two cores of an AMD EPYC
+    Breakout, --environment-train-frames-max 560000 --agent-update-frequency 4
+    --agent-epsilon-greedy-epsilon-final 0.02 --agent-epsilon-greedy-annealing 250000
+    --agent-replay-buffer-initial 20000: 41.71 after 54 minutes (the lecture's run: 32.154)
+
 Deviations
     lecture or [8]                        this file                           why
     ------------------------------------  ----------------------------------  --------------------

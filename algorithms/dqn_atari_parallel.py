@@ -23,6 +23,9 @@ Run it
     torchrun --nnodes 2 --nproc-per-node 2 --rdzv-backend c10d --rdzv-id 1 \
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
+Measured, on two cores of an AMD EPYC, one update in four
+    165 frames a second with 4 simulators; dqn_atari.py makes 154
+
 Deviations, beside those of dqn_atari.py
     Algorithm 6                           this file                           why
     ------------------------------------  ----------------------------------  --------------------
