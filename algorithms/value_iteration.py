@@ -97,7 +97,8 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
 
 
 def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
-    """Algorithm 3: V* (S,), Q* (rows,), and the largest change of V in each sweep.
+    """Algorithm 3: V* (S,), Q* (rows,), and the largest change of a V(s) in each sweep, relative to
+    |V(s)| if that is above 1.
 
     Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
     """
@@ -106,11 +107,10 @@ def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_itera
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         Q = backup(P, R, V, discount)  # (rows,)
         V, V_old = maximum(Q, first_row), V  # (S,)
-        change = np.abs(V - V_old)  # (S,)
-        changes.append(float(change.max()))
+        changes.append(float((np.abs(V - V_old) / np.maximum(1, np.abs(V))).max()))
         if converged:  # one sweep more, i = 5 in the lecture's table: now Q is that of V*
             return V, Q, changes
-        converged = (change <= tolerance * np.maximum(1, np.abs(V))).all()
+        converged = changes[-1] <= tolerance
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
@@ -240,7 +240,7 @@ def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> 
     left, right = figure.subplots(1, 2)
     left.plot(range(1, len(changes) + 1), changes, marker=".")
     scale = "log" if any(changes) else "linear"
-    left.set(xlabel="iteration", ylabel="max |V_i - V_i-1|", yscale=scale)
+    left.set(xlabel="iteration", ylabel="largest change of V", yscale=scale)
     if len(grid) == 2 and np.prod(grid) == len(V):
         place = np.stack(np.divmod(np.arange(len(V)), grid[1])[::-1], axis=1)  # (S, 2) x, y
         step = P @ place - P.sum(axis=1)[:, None] * np.repeat(place, P.shape[0] // len(V), axis=0)
@@ -280,7 +280,8 @@ def main(args: Args) -> None:
             values.append(maximum(Q_i, first_row))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
-    report(args.output_json, model, V, Q, policy, len(changes), changes[-1])
+    residual = np.abs(maximum(backup(P, R, V, args.discount), first_row) - V).max()
+    report(args.output_json, model, V, Q, policy, len(changes), residual)
     if args.figure:
         save_figure(args.figure, P, policy, V, grid, changes)
 
