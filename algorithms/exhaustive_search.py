@@ -179,14 +179,13 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
-    items = [item.partition("=") for item in args.env_kwargs.split()]
-    values = {"true": True, "false": False}
-    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
     model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
+            kwargs = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
@@ -213,8 +212,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
-            line = f"error: state {s}, action {a}: {transitions} makes no sense"
-            raise SystemExit(line) from None
+            raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]

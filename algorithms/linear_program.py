@@ -112,17 +112,17 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
     tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.995^steps to the end, or to where it rests.
+    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So value
+    # iteration decides again, over the tied actions alone, with 1 for an end and discount 0.995.
     idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
         nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
         near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
+    return rows[np.searchsorted(rows, first_row)], near > 0  # the first such row of each state
 
 
 def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
@@ -145,14 +145,13 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
-    items = [item.partition("=") for item in args.env_kwargs.split()]
-    values = {"true": True, "false": False}
-    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
     model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
+            kwargs = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
@@ -179,8 +178,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
-            line = f"error: state {s}, action {a}: {transitions} makes no sense"
-            raise SystemExit(line) from None
+            raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]

@@ -17,7 +17,7 @@ Run it
     python algorithms/tabular_q_gridworld.py --step-reward -0.5    # a hurried robot risks the -1
     python algorithms/tabular_q_gridworld.py --slip-probability 0  # Figure 3, left
     python algorithms/tabular_q_gridworld.py --env-id CliffWalking-v1 --learning-rate-exponent 0
-    python algorithms/tabular_q_gridworld.py --env-id FrozenLake-v1 --env-kwargs is_slippery=false
+    python algorithms/tabular_q_gridworld.py --env-id FrozenLake-v1 --env-kwargs is_slippery=False
     tensorboard --logdir runs
 
 Measured, by `python benchmarks/gridworld.py seeds`
@@ -79,7 +79,7 @@ class Args:
     env_id: str = "GridWorld"
     """or a Gymnasium environment with Discrete observations and actions"""
     env_kwargs: str = ""
-    """that environment's arguments, as in "map_name=8x8 is_slippery=false" """
+    """that environment's arguments, as in "map_name=8x8 is_slippery=False" """
 
     seed: int = 0
     """seed of the environment's and of the exploration's random generators"""
@@ -156,14 +156,9 @@ def make_world(args: Args) -> gym.Env:
     """GridWorld, or the environment of --env-id, with a time limit. Raises SystemExit, one line."""
     if args.env_id == "GridWorld":
         return gym.wrappers.TimeLimit(GridWorld(args.slip_probability, args.step_reward), 1000)
-    kwargs = {}
-    for item in args.env_kwargs.split():
-        name, _, text = item.partition("=")
-        try:
-            kwargs[name] = json.loads(text.lower())  # 3, 0.5, true, False
-        except ValueError:
-            kwargs[name] = text  # 8x8
     try:
+        kwargs = (item.split("=") for item in args.env_kwargs.split())
+        kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
         env = gym.make(args.env_id, disable_env_checker=True, **kwargs)
     except Exception as error:  # whatever the constructor of somebody's environment raises
         raise SystemExit(f"error: cannot make {args.env_id}: {error}") from None

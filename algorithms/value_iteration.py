@@ -13,8 +13,8 @@ Run it
     python algorithms/value_iteration.py --model my_mdp.json --discount 0.95 --output-json best.json
 
 Measured
-    The first command converges in 5 sweeps to V* = (11, 1, 4) and π* = (a1, a1, a2). FrozenLake-v1
-    at discount 1: V(0) = 0.823529411742, 14/17, after 994 sweeps.
+    The first command converges in 4 sweeps to V* = (11, 1, 4) and π* = (a1, a1, a2). FrozenLake-v1
+    at discount 1: V(0) = 0.823529411742, 14/17, after 993 sweeps.
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
@@ -59,7 +59,7 @@ class Args:
     output_json: Path | None = None
     """write values, action values and policy to this file"""
     figure: Path | None = None
-    """draw the convergence and, in a grid world, V and π, to this .png"""
+    """draw V and π of FrozenLake or CliffWalking to this .png"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
@@ -69,6 +69,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s1": {"a1": [(1.0, "sG", 1, True)]},
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
+
+ARROWS = {"FrozenLakeEnv": "←↓→↑", "CliffWalkingEnv": "↑→↓←"}  # of actions 0 to 3
 
 # P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
 #     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
@@ -97,20 +99,16 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
 
 
 def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
-    """Algorithm 3: V* (S,), Q* (rows,), and the largest change of a V(s) in each sweep, relative to
-    |V(s)| if that is above 1.
+    """Algorithm 3: V* (S,) and the number of sweeps.
 
     Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
     """
-    V, changes, converged = np.zeros(len(first_row)), [], False  # V: (S,)
-    for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
+    V, sweeps = np.zeros(len(first_row)), range(1, max_iterations + 1)  # V: (S,)
+    for sweep in tqdm(sweeps, "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
-        Q = backup(P, R, V, discount)  # (rows,)
-        V, V_old = maximum(Q, first_row), V  # (S,)
-        changes.append(float((np.abs(V - V_old) / np.maximum(1, np.abs(V))).max()))
-        if converged:  # one sweep more, i = 5 in the lecture's table: now Q is that of V*
-            return V, Q, changes
-        converged = changes[-1] <= tolerance
+        V, V_old = maximum(backup(P, R, V, discount), first_row), V  # (S,)
+        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
+            return V, sweep
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
@@ -118,17 +116,17 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
     tie, π takes one that soonest ends, or comes to rest for nothing."""
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,)
+    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So of the
-    # tied actions take the one with most 0.995^steps to the end, or to where it rests.
+    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So value
+    # iteration decides again, over the tied actions alone, with 1 for an end and discount 0.995.
     idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
     near, before = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(near, before):
         nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
         near, before = maximum(nearness, first_row), near  # (S,)
     rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)], near > 1e-300  # the first row of each state
+    return rows[np.searchsorted(rows, first_row)], near > 0  # the first such row of each state
 
 
 def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
@@ -151,14 +149,13 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
-    items = [item.partition("=") for item in args.env_kwargs.split()]
-    values = {"true": True, "false": False}
-    kwargs = {name: values.get(text.lower(), text) for name, _, text in items}
     model, env = FIGURE_5, None
     try:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
+            kwargs = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
@@ -185,8 +182,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
-            line = f"error: state {s}, action {a}: {transitions} makes no sense"
-            raise SystemExit(line) from None
+            raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
     p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
@@ -234,28 +230,16 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
-def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> None:
-    """Draw the changes and, in a grid world, V (S,) as colours and π (S,) as arrows."""
-    figure = Figure(figsize=(12, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.plot(range(1, len(changes) + 1), changes, marker=".")
-    scale = "log" if any(changes) else "linear"
-    left.set(xlabel="iteration", ylabel="largest change of V", yscale=scale)
-    if len(grid) == 2 and np.prod(grid) == len(V):
-        place = np.stack(np.divmod(np.arange(len(V)), grid[1])[::-1], axis=1)  # (S, 2) x, y
-        step = P @ place - P.sum(axis=1)[:, None] * np.repeat(place, P.shape[0] // len(V), axis=0)
-        step[(np.abs(step) > 1).any(axis=1)] = 0  # a jump back to the start is no step
-        # An action's arrow is its mean step over the states: slips cancel out.
-        arrow = step.reshape(len(V), -1, 2).mean(axis=0)  # (A, 2)
-        acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, no goal
-        image = right.imshow(np.where(acts, V, np.nan).reshape(grid))
-        figure.colorbar(image, label="V(s)", shrink=0.8)
-        u, v = arrow[policy[acts] % len(arrow)].T  # (cells,) each
-        cell = 2 * np.abs(arrow).max()  # the longest arrow is half a cell
-        right.quiver(*place[acts].T, u, v, pivot="mid", angles="xy", scale_units="xy", scale=cell)
-        right.set(title="V and π")
-    else:
-        right.set_axis_off()
+def save_figure(path: Path, env: gym.Env, P, V, policy) -> None:
+    """Draw V (S,) as colours and π (S,) as arrows, where the agent comes and goes on."""
+    acts = P.sum(axis=0) > 0  # (S,) not a hole, a goal or the cliff
+    cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # (rows, columns)
+    figure = Figure(layout="constrained")
+    axes = figure.add_subplot(title="V and π")
+    figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
+    for s in np.flatnonzero(acts):
+        y, x = divmod(s, cells.shape[1])
+        axes.text(x, y, ARROWS[type(env).__name__][policy[s] % 4], ha="center", va="center")
     figure.savefig(path, format="png", dpi=120)
 
 
@@ -265,25 +249,27 @@ def save_figure(path: Path, P, policy, V, grid: tuple, changes: list[float]) -> 
 def main(args: Args) -> None:
     """Solve the MDP that the flags name, and report."""
     model, env = read_model(args)
-    grid = getattr(env, "shape", np.shape(getattr(env, "desc", ())))  # CliffWalking, FrozenLake
-    P, R, first_row = mdp = arrays(model)
-    V, Q, changes = value_iteration(*mdp, args.discount, args.tolerance, args.max_iterations)
+    if args.figure and type(env).__name__ not in ARROWS:
+        raise SystemExit("error: --figure needs FrozenLake or CliffWalking")
+    P, R, first_row = arrays(model)
+    V, sweeps = value_iteration(P, R, first_row, args.discount, args.tolerance, args.max_iterations)
+    Q = backup(P, R, V, args.discount)  # (rows,)
     policy, ends = greedy_policy(P, R, first_row, Q)
     # A loop whose rewards cancel (+1, -1, +1, …) can hold V above what any policy gets.
     if args.discount == 1 and (np.abs(V[~ends]) > 1e-9).any():
         raise SystemExit("error: V* is not found: there is a loop without end, and without reward")
-    if len(R) <= 12:  # small enough to be worked through on paper
-        values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]  # V_0, V_1, ... once more
-        for _ in changes[:9]:
+    if len(R) <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
+        values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]
+        for _ in range(min(sweeps + 1, 9)):  # Q converges a sweep after V
             Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
             values.append(maximum(Q_i, first_row))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
-    residual = np.abs(maximum(backup(P, R, V, args.discount), first_row) - V).max()
-    report(args.output_json, model, V, Q, policy, len(changes), residual)
+    residual = np.abs(maximum(Q, first_row) - V).max()
+    report(args.output_json, model, V, Q, policy, sweeps, residual)
     if args.figure:
-        save_figure(args.figure, P, policy, V, grid, changes)
+        save_figure(args.figure, env, P, V, policy)
 
 
 if __name__ == "__main__":
