@@ -59,7 +59,7 @@ class Args:
     output_json: Path | None = None
     """write values, action values and policy to this file"""
     figure: Path | None = None
-    """draw V and π of FrozenLake or CliffWalking to this .png"""
+    """draw the convergence, and V and π of FrozenLake and CliffWalking, to this .png"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
@@ -99,16 +99,18 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
 
 
 def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
-    """Algorithm 3: V* (S,) and the number of sweeps.
+    """Algorithm 3: V* (S,), and the largest change of a V(s) in each sweep, relative to |V(s)| if
+    that is above 1.
 
     Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
     """
-    V, sweeps = np.zeros(len(first_row)), range(1, max_iterations + 1)  # V: (S,)
-    for sweep in tqdm(sweeps, "value iteration", unit=" sweeps", delay=2, leave=False):
+    V, changes = np.zeros(len(first_row)), []  # V: (S,)
+    for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         V, V_old = maximum(backup(P, R, V, discount), first_row), V  # (S,)
-        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
-            return V, sweep
+        changes.append((np.abs(V - V_old) / np.maximum(1, np.abs(V))).max())
+        if changes[-1] <= tolerance:
+            return V, changes
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
@@ -230,16 +232,19 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
-def save_figure(path: Path, env: gym.Env, P, V, policy) -> None:
-    """Draw V (S,) as colours and π (S,) as arrows, where the agent comes and goes on."""
-    acts = P.sum(axis=0) > 0  # (S,) not a hole, a goal or the cliff
-    cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # (rows, columns)
-    figure = Figure(layout="constrained")
-    axes = figure.add_subplot(title="V and π")
-    figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
-    for s in np.flatnonzero(acts):
-        y, x = divmod(s, cells.shape[1])
-        axes.text(x, y, ARROWS[type(env).__name__][policy[s] % 4], ha="center", va="center")
+def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[float]) -> None:
+    """Draw the changes and, of FrozenLake and CliffWalking, V (S,) as colours, π (S,) as arrows."""
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest change of V")
+    axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), marker=".")
+    if arrows := ARROWS.get(type(env).__name__):
+        acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, goal or cliff
+        cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # (rows, columns)
+        axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
+        figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
+        for s in np.flatnonzero(acts):
+            y, x = divmod(s, cells.shape[1])
+            axes.text(x, y, arrows[policy[s] % 4], ha="center", va="center", fontsize=16)
     figure.savefig(path, format="png", dpi=120)
 
 
@@ -249,10 +254,9 @@ def save_figure(path: Path, env: gym.Env, P, V, policy) -> None:
 def main(args: Args) -> None:
     """Solve the MDP that the flags name, and report."""
     model, env = read_model(args)
-    if args.figure and type(env).__name__ not in ARROWS:
-        raise SystemExit("error: --figure needs FrozenLake or CliffWalking")
     P, R, first_row = arrays(model)
-    V, sweeps = value_iteration(P, R, first_row, args.discount, args.tolerance, args.max_iterations)
+    limits = args.discount, args.tolerance, args.max_iterations
+    V, changes = value_iteration(P, R, first_row, *limits)
     Q = backup(P, R, V, args.discount)  # (rows,)
     policy, ends = greedy_policy(P, R, first_row, Q)
     # A loop whose rewards cancel (+1, -1, +1, …) can hold V above what any policy gets.
@@ -260,16 +264,16 @@ def main(args: Args) -> None:
         raise SystemExit("error: V* is not found: there is a loop without end, and without reward")
     if len(R) <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]
-        for _ in range(min(sweeps + 1, 9)):  # Q converges a sweep after V
+        for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V
             Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
             values.append(maximum(Q_i, first_row))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
     residual = np.abs(maximum(Q, first_row) - V).max()
-    report(args.output_json, model, V, Q, policy, sweeps, residual)
+    report(args.output_json, model, V, Q, policy, len(changes), residual)
     if args.figure:
-        save_figure(args.figure, env, P, V, policy)
+        save_figure(args.figure, env, P, V, policy, changes)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,8 @@ def our_solve(what: str, size: int) -> tuple[float, int, np.ndarray]:
     if what == "value_iteration":
         # QuantEcon's rule for a change of V; ours is relative to |V|, which is at most 1 / (1 - γ)
         tolerance = EPSILON * (1 - DISCOUNT) ** 2 / (2 * DISCOUNT)
-        V, iterations = script.value_iteration(P, R, first_row, DISCOUNT, tolerance)
+        V, changes = script.value_iteration(P, R, first_row, DISCOUNT, tolerance)
+        iterations = len(changes)
         script.greedy_policy(P, R, first_row, script.backup(P, R, V, DISCOUNT))
     elif what == "policy_iteration":  # from the greedy policy of max_a R(s, a), as QuantEcon does
         Q = script.backup(P, R, script.maximum(R, first_row), DISCOUNT)
