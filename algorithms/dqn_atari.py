@@ -154,12 +154,11 @@ def read_args() -> Args:
     if args.resume:
         try:
             saved = json.loads((Path(args.resume) / "args.json").read_text())
-            if set(saved) != set(vars(args)):
-                raise ValueError("its flags are another script's")
-        except (OSError, ValueError, TypeError) as error:
+            defaults = Args(**saved)
+        except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=Args(**saved))  # the run's own flags are now the defaults
-        changed = {name for name, value in vars(args).items() if value != saved[name]}
+        args = tyro.cli(Args, default=defaults)
+        changed = {name for name, value in vars(args).items() if value != saved.get(name)}
         longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
         if not longer or not changed <= {"resume", "environment_train_frames_max"}:
             raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
@@ -716,13 +715,11 @@ def main(args: Args) -> None:
         a = epsilon_greedy(q_network, replay.decode(s), epsilon, exploration_rng)
         s_next, r, terminated, truncated, info = env.step(a)
         replay.add(s, a, r, s_next, terminated)
-        s = s_next
 
         # 14-17  If the episode has ended, reset.
         episode_ended = terminated or truncated
-        if episode_ended:
-            counters.episodes += 1
-            s, _ = env.reset()
+        counters.episodes += episode_ended
+        s = env.reset()[0] if episode_ended else s_next
         if "episode" in info:  # a game, not only a life: the statistics are below LifeLoss
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
+#     "ale-py>=0.12", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
 #     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
@@ -58,7 +58,6 @@ from typing import Literal
 
 import ale_py
 import cv2
-import filelock
 import gymnasium as gym
 import lz4.block
 import numpy as np
@@ -156,12 +155,11 @@ def read_args() -> Args:
     if args.resume:
         try:
             saved = json.loads((Path(args.resume) / "args.json").read_text())
-            if set(saved) != set(vars(args)):
-                raise ValueError("its flags are another script's")
-        except (OSError, ValueError, TypeError) as error:
+            defaults = Args(**saved)
+        except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=Args(**saved))  # the run's own flags are now the defaults
-        changed = {name for name, value in vars(args).items() if value != saved[name]}
+        args = tyro.cli(Args, default=defaults)
+        changed = {name for name, value in vars(args).items() if value != saved.get(name)}
         longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
         if not longer or not changed <= {"resume", "environment_train_frames_max"}:
             raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
@@ -540,20 +538,6 @@ def write_text(path: Path, text: str) -> None:
     write_file(path, lambda temporary: temporary.write_text(text))
 
 
-def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
-    """The run directory, `args.resume` or a new one, and the lock on it, which ends with the
-    process. Exits with one line if it cannot be written or another process writes it."""
-    name = f"{args.env_id}__{script}__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-    run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
-    lock = filelock.FileLock(run_dir / ".lock", timeout=0)
-    try:
-        run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
-        lock.acquire()
-    except (OSError, filelock.Timeout) as error:
-        raise SystemExit(f"error: {run_dir} is in use or cannot be written: {error}") from None
-    return run_dir, lock
-
-
 # ---- main ----------------------------------------------------------------------------------------
 
 
@@ -595,7 +579,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     # The same θ, under a wrapper that averages the gradients of all processes in backward().
     shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
     if rank == 0:
-        run_dir, _lock = open_run(args, Path(__file__).stem)
+        now = time.strftime("%Y%m%d-%H%M%S")
+        name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{now}"
+        run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
+        run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
         (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
@@ -621,14 +608,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     loss = q = torch.zeros(())
     started = time.monotonic() - counters.seconds
     save_time = window_time = time.monotonic()
-    window_frames, stops = counters.frames, 0
-
-    # A frame is counted when its action is chosen, over all simulators of all processes. Learning
-    # starts `initial` frames from here, in whole steps. After n frames there have been
-    # (n - start) // agent_update_frequency updates, and those before the run was resumed.
-    step = args.num_simulators * ranks
-    start = counters.frames + math.ceil(args.agent_replay_buffer_initial / step) * step
-    updates_before = counters.updates
+    window_frames, stops, due = counters.frames, 0, 0
+    step = args.num_simulators * ranks  # frames: one of each simulator of each process
 
     # 8, 30  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max and not stops:
@@ -640,10 +621,12 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
         envs.step_async(a)
 
-        # 18-23  If |𝒟| ≥ initial (before, `due` is 0): sample ℬ ⊆ 𝒟, gradient descent. The lines
-        # stand in another order than Algorithm 6's: the simulators step meanwhile.
-        due = max(0, counters.frames - start) // args.agent_update_frequency
-        for _ in range(updates_before + due - counters.updates):
+        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while an update is due for the
+        # frames so far. Before lines 13-17, unlike in Algorithm 6: the simulators step meanwhile.
+        learning = replay.added * ranks >= args.agent_replay_buffer_initial
+        due += step if learning else 0  # frames
+        while due >= args.agent_update_frequency:
+            due -= args.agent_update_frequency
             batch_size = args.optimizer_minibatch_size // ranks
             minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
             loss, q = update(shared_network, target_network, optimizer, minibatch,
@@ -699,7 +682,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
                        "losses/td_loss": loss.item(), "losses/q_values": q.mean().item()}
             for name, value in scalars.items():
                 writer.add_scalar(name, value, counters.frames)
-            if counters.frames > start:
+            if learning:
                 counters.speeds.append(speed)
             window_time, window_frames = time.monotonic(), counters.frames
         late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes

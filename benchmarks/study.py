@@ -169,8 +169,7 @@ def next_step(flags: list[str]) -> tuple[str, list[str]]:
 
 def run(command: list[str]) -> int:
     """Run to the end and return the exit code. A Ctrl-C stops the run with a checkpoint."""
-    # In a session of its own it does not get the terminal's Ctrl-C, but one signal, from here.
-    process = subprocess.Popen(command, start_new_session=True)
+    process = subprocess.Popen(command)
     try:
         return process.wait()
     except KeyboardInterrupt:
