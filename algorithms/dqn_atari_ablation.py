@@ -12,7 +12,8 @@ dqn_atari.py with three switches; `diff dqn_atari.py dqn_atari_ablation.py` show
     --no-target-network                      θ⁻ is θ itself; still no gradient passes through y
     --no-replay-buffer                       ℬ is the last transitions, in their order
 
-With none of them a run is bit for bit that of dqn_atari.py with the same --env-id and --precision.
+With none of them a run is bit for bit that of dqn_atari.py with the same --env-id and --precision
+(which it else chooses by the clock).
 evaluations.csv has one column more: the mean of max Q(s, a) over 500 held-out states. Without a
 target network it may run away.
 
@@ -147,11 +148,12 @@ def read_args() -> Args:
             defaults = Args(**saved)
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=defaults)
+        args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
         changed = {name for name, value in vars(args).items() if value != saved.get(name)}
-        longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
-        if not longer or not changed <= {"resume", "environment_train_frames_max"}:
-            raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
+        shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
+        if shorter or changed - {"resume", "environment_train_frames_max"}:
+            raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
+    # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
@@ -164,11 +166,11 @@ def read_args() -> Args:
 
 # ---- problem: the Atari environment and its wrappers ---------------------------------------------
 #
-#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12   60 a second
-#   action           a₁ ────────  a₂ ────────  a₃ ─────── repeated 4 times, rewards summed
-#   max-pool               3∨4         7∨8       11∨12    some sprites are drawn every other frame
-#   frame          x₀       x₁          x₂          x₃    grey, 84×84: the agent's unit of time
-#   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
+#   emulator frame  0 │ 1  2  3  4 │ 5  6  7  8 │ 9 10 11 12    60 a second
+#   action            │ a₀ ─────── │ a₁ ─────── │ a₂ ────────   repeated 4 times, rewards summed
+#   max-pool          │       3∨4  │       7∨8  │      11∨12    some sprites are in every other one
+#   frame           x₀│         x₁ │         x₂ │         x₃    grey, 84×84: the unit of time
+#   state             s₀ = (x₀, x₀, x₀, x₀), s₁ = (x₀, x₀, x₀, x₁), s₂ = (x₀, x₀, x₁, x₂), …
 
 
 class JoystickActions(gym.ActionWrapper):
@@ -225,7 +227,8 @@ class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
 
     Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
-    it reset the emulator, the later lives would never be seen; if it stepped, a frame would be.
+    it reset the emulator, later lives would never be played; if it stepped, nobody would choose an
+    action.
     """
 
     def __init__(self, env: gym.Env):
@@ -298,14 +301,14 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 
 class ReplayMemory:
-    """𝒟: the last `capacity` transitions (§5.3). One is references to its 5 frames, an action, a
-    clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
+    """𝒟: the last `capacity` transitions (§5.3). A transition is references to 5 frames, an action,
+    a clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
     Each is whole in itself, so none can mix two episodes."""
 
     def __init__(self, capacity: int, shape: tuple[int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
         self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
-        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal
+        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -323,18 +326,17 @@ class ReplayMemory:
         s' like s, terminal (B,) bool, on the device."""
         frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
         frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
-        # one (B, 3) array travels to the device; (B,) each
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
         return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
     def state_dict(self) -> dict:
         """For a checkpoint: every frame once, and per transition the places of its frames."""
-        stored = self.frames[: len(self)]
+        stored = self.frames[: len(self)]  # a frame that transitions share is one object
         unique = {id(frame): frame for frames in stored for frame in frames}
         place = dict(zip(unique, range(len(unique)), strict=True))
         return {
@@ -364,7 +366,7 @@ class QNetwork(nn.Module):
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # of the screen: 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(
             nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
@@ -376,7 +378,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # Q keeps float32's digits
+        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -406,13 +408,13 @@ def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
     is (4, 84, 84) uint8."""
     if rng.random() < epsilon:
         return int(rng.integers(q_network.head.out_features))
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
 
 
 def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
-    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
-    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
-    `minibatch` is what the replay memory's gather returns."""
+    """One step of gradient descent (Algorithm 6, lines 20-22). `minibatch` is what the replay
+    memory's gather returns. bfloat16 is for the products in the layers alone; θ, Q, the loss and
+    Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,)."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         # Q(s_j, a_j; θ)
@@ -423,8 +425,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
         with torch.no_grad():
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
-    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
-    # as in line 22: the RMSProp of [8] is meant for it; Adam's steps do not depend on the scale.
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
+    # in line 22: the constant in RMSProp's root [8] is made for it, and Adam's steps have no scale.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -435,8 +437,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 
 class NatureRMSprop(torch.optim.Optimizer):
-    """The RMSProp that [8] released (Figure 18): centred, no momentum, its constant inside the
-    root. PyTorch's adds it outside; "gradient momentum 0.95" is the decay of the mean gradient."""
+    """The RMSProp that [8] released (Figure 18): centred, without momentum, its constant inside the
+    root, where PyTorch's is outside. Figure 18's "gradient momentum" is the decay of g, below."""
 
     def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
         super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
@@ -481,7 +483,8 @@ def choose_precision(args: Args) -> str:
 
 @torch.no_grad()
 def dead_units(q_network: QNetwork, states: torch.Tensor) -> float:
-    """The share of the linear layer's 512 units that are 0 in all of the states (B, 4, 84, 84)."""
+    """The share of the linear layer's 512 units that are 0 in all of the states (B, 4, 84, 84).
+    They get no gradient. A share that grows tells of too large a learning rate."""
     return (q_network.layers(states / 255) == 0).all(dim=0).float().mean().item()
 
 
@@ -520,7 +523,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    # [seed, 0] is training's
+    # Seeds: [seed, 0] is training's, [seed, 1] the test's, then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -534,6 +537,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             state, _ = env.reset()
         if len(finished) == games:
             break
+    # what RecordEpisodeStatistics has counted so far
     unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
     env.close()
     return finished, unfinished
@@ -606,7 +610,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember from frame to frame."""
+    """What the emulator and the wrappers remember from frame to frame, and do not set anew."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
@@ -614,8 +618,9 @@ def environment_state(env: gym.Env) -> dict:
 
 def restore_environment(env: gym.Env, saved: dict) -> None:
     """Put `env` where `environment_state` was taken."""
+    # Easy to get wrong: before its first action the emulator takes no state whole (Q*bert, Tetris).
     env.reset()
-    env.step(0)  # easy to get wrong: before its first action Q*bert's emulator takes no state whole
+    env.step(0)
     env.unwrapped.ale.restoreState(ale_py.ALEState(saved.pop("emulator")))
     for name, value in saved.items():
         env.set_wrapper_attr(name, value)
@@ -631,6 +636,7 @@ def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generato
         for name, part in parts.items():
             part.load_state_dict(saved[name])
         restore_environment(env, saved["environment"])
+        # After it: reset() has drawn no-ops.
         for rng, state in zip(rngs, saved["rngs"], strict=True):
             rng.bit_generator.state = state
         return Counters(**saved["counters"])
@@ -657,10 +663,11 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 
 def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind."""
-    # Adam's moments of dead units fade into denormal numbers, which make its step 10 times slower.
-    torch.set_flush_denormal(True)  # before the first parallel work: threads inherit it
+    # Adam's moments of dead units fade below 1e-38, where a CPU is 10 times slower: make them 0, in
+    # the threads, too, which inherit this from here on.
+    torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())
-    args.threads = torch.get_num_threads()
+    args.threads = torch.get_num_threads()  # into args.json: a resumed run has as many
     if args.device == "auto":
         args.device = "cuda" if torch.cuda.is_available() else "cpu"
     rngs = np.random.default_rng([args.seed, 0]).spawn(3)
@@ -669,7 +676,7 @@ def main(args: Args) -> None:
     # 1  Initialize the Atari 2600 simulator.
     env = FrameHistory(make_env(args, no_op_rng, training=True), args.agent_history_length)
     actions = env.get_wrapper_attr("meanings")
-    run_dir, _lock = open_run(args, Path(__file__).stem)
+    run_dir, _lock = open_run(args, Path(__file__).stem)  # locked for as long as there is _lock
     if args.precision == "auto":
         args.precision = choose_precision(args)
     # 2  Initialize 𝒟.
@@ -679,7 +686,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     q_network = QNetwork(args.agent_history_length, *shape, len(actions))
     initialize(q_network, args.initialization)
-    q_network.to(args.device, memory_format=torch.channels_last)
+    q_network.to(args.device, memory_format=torch.channels_last)  # quicker convolutions
     optimizer = make_optimizer(args, q_network)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
@@ -697,6 +704,7 @@ def main(args: Args) -> None:
         s = env.get_wrapper_attr("history")
     write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
     (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
+    # Points after the checkpoint are purged: they are drawn once more.
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
 
@@ -722,7 +730,7 @@ def main(args: Args) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
-    loss = q = torch.zeros(())
+    loss = q = torch.zeros(())  # until the first update
     started = time.monotonic() - counters.seconds
     checkpoint_time = window_time = time.monotonic()
     window_frames = counters.frames
@@ -781,6 +789,7 @@ def main(args: Args) -> None:
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
+            # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
             scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
                        "losses/td_loss": loss.item(), "losses/q_values": q.mean().item(),

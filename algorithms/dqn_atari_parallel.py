@@ -35,7 +35,7 @@ Deviations, beside those of dqn_atari.py
                                           evaluations at the next step        together
     ℬ ⊆ 𝒟                                 each process draws its share of ℬ   no transition travels
                                           from its part of 𝒟
-    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam does not mind
+    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam has no scale
     A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
     acts until that holds the initial number, then learns on; its random numbers start anew. On
     several machines all need runs/.
@@ -158,11 +158,12 @@ def read_args() -> Args:
             defaults = Args(**saved)
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=defaults)
+        args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
         changed = {name for name, value in vars(args).items() if value != saved.get(name)}
-        longer = args.environment_train_frames_max >= saved["environment_train_frames_max"]
-        if not longer or not changed <= {"resume", "environment_train_frames_max"}:
-            raise SystemExit(f"error: a resumed run keeps its own flags, {', '.join(changed)} too")
+        shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
+        if shorter or changed - {"resume", "environment_train_frames_max"}:
+            raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
+    # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
@@ -175,11 +176,11 @@ def read_args() -> Args:
 
 # ---- problem: the Atari environment and its wrappers ---------------------------------------------
 #
-#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12   60 a second
-#   action           a₁ ────────  a₂ ────────  a₃ ─────── repeated 4 times, rewards summed
-#   max-pool               3∨4         7∨8       11∨12    some sprites are drawn every other frame
-#   frame          x₀       x₁          x₂          x₃    grey, 84×84: the agent's unit of time
-#   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
+#   emulator frame  0 │ 1  2  3  4 │ 5  6  7  8 │ 9 10 11 12    60 a second
+#   action            │ a₀ ─────── │ a₁ ─────── │ a₂ ────────   repeated 4 times, rewards summed
+#   max-pool          │       3∨4  │       7∨8  │      11∨12    some sprites are in every other one
+#   frame           x₀│         x₁ │         x₂ │         x₃    grey, 84×84: the unit of time
+#   state             s₀ = (x₀, x₀, x₀, x₀), s₁ = (x₀, x₀, x₀, x₁), s₂ = (x₀, x₀, x₁, x₂), …
 
 
 class JoystickActions(gym.ActionWrapper):
@@ -236,7 +237,8 @@ class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
 
     Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
-    it reset the emulator, the later lives would never be seen; if it stepped, a frame would be.
+    it reset the emulator, later lives would never be played; if it stepped, nobody would choose an
+    action.
     """
 
     def __init__(self, env: gym.Env):
@@ -306,13 +308,15 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 
 def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> gym.Env:
-    """The game, up to the frame, in a process of its own; it ends when its pipe is closed. The
-    process with the number `learner` makes one, too, to see what it is like."""
+    """The game, up to the frame, in a process of its own, which ends when its pipe is closed.
+    AsyncVectorEnv makes one more in the process with the number `learner`, for its spaces."""
     if os.getpid() != learner:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the learner alone answers signals:
+        # The learner answers signals and reports errors: the terminal's and torchrun's signals do
+        # not reach another session, and an error comes to the learner through the pipe.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if os.name == "posix":
-            os.setsid()  # neither the terminal's nor torchrun's reach another session
-        sys.stderr = open(os.devnull, "w")  # the learner hears of errors through the pipe
+            os.setsid()
+        sys.stderr = open(os.devnull, "w")
     return make_env(args, no_op_rng, training=True)
 
 
@@ -320,14 +324,14 @@ def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> 
 
 
 class ReplayShare:
-    """One process's part of 𝒟: its last `capacity` transitions (§5.3). One is references to its 5
-    frames, an action, a clipped reward and whether s' is terminal; arrays are made when a minibatch
-    is drawn (§7.3.2). Each is whole in itself, so none can mix two episodes or two simulators."""
+    """One process's part of 𝒟: its last `capacity` transitions (§5.3). A transition is references
+    to 5 frames, an action, a clipped reward and whether s' is terminal; arrays are made when a
+    minibatch is drawn (§7.3.2). Each is whole, so none can mix two episodes or two simulators."""
 
     def __init__(self, capacity: int, shape: tuple[int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
         self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
-        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal
+        self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -345,13 +349,12 @@ class ReplayShare:
         s' like s, terminal (B,) bool, on the device."""
         frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
         frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
-        # one (B, 3) array travels to the device; (B,) each
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
         return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
 
@@ -363,7 +366,7 @@ class QNetwork(nn.Module):
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # of the screen: 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(
             nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
@@ -375,7 +378,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # Q keeps float32's digits
+        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -401,7 +404,7 @@ def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
     is (4, 84, 84) uint8."""
     if rng.random() < epsilon:
         return int(rng.integers(q_network.head.out_features))
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()  # waits for an accelerator
+    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
 
 
 @torch.inference_mode()
@@ -413,9 +416,9 @@ def epsilon_greedy_batch(q_network, states: torch.Tensor, epsilon: float, rng) -
 
 
 def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
-    """One step of gradient descent (Algorithm 6, lines 20-22). In bfloat16 only the layers multiply
-    in it; θ, Q, the loss and Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,).
-    `minibatch` is what the replay memory's gather returns."""
+    """One step of gradient descent (Algorithm 6, lines 20-22). `minibatch` is what the replay
+    memory's gather returns. bfloat16 is for the products in the layers alone; θ, Q, the loss and
+    Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,)."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         # Q(s_j, a_j; θ)
@@ -426,8 +429,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
         with torch.no_grad():
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
-    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. The sum,
-    # as in line 22: the RMSProp of [8] is meant for it; Adam's steps do not depend on the scale.
+    # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
+    # in line 22: the constant in RMSProp's root [8] is made for it, and Adam's steps have no scale.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -453,7 +456,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    # [seed, 0] is training's
+    # Seeds: [seed, 0] is training's, [seed, 1] the test's, then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -467,6 +470,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             state, _ = env.reset()
         if len(finished) == games:
             break
+    # what RecordEpisodeStatistics has counted so far
     unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
     env.close()
     return finished, unfinished
@@ -543,13 +547,15 @@ def write_text(path: Path, text: str) -> None:
 
 def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -> None:
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
-    # Adam's moments of dead units fade into denormal numbers, which make its step 10 times slower.
-    torch.set_flush_denormal(True)  # before the first parallel work: threads inherit it
+    # Adam's moments of dead units fade below 1e-38, where a CPU is 10 times slower: make them 0, in
+    # the threads, too, which inherit this from here on.
+    torch.set_flush_denormal(True)
 
     # 1  Initialize the Atari 2600 simulators.
     actions = envs.get_attr("meanings")[0]
     x, _ = envs.reset(seed=args.seed + rank * args.num_simulators)  # (N, 84, 84) uint8
-    s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]  # N histories
+    # dqn_atari.py's FrameHistory, but on this side of the pipe: N histories of LZ4 bytes
+    s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]
     # 2  Initialize 𝒟.
     shape = (args.environment_state_height, args.environment_state_width)
     replay = ReplayShare(args.agent_replay_buffer_maximum_length // ranks, shape, args.device)
@@ -585,6 +591,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
         (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
+        # Points after the checkpoint are purged: they are drawn once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
 
@@ -605,7 +612,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1,
                disable=rank > 0)
-    loss = q = torch.zeros(())
+    loss = q = torch.zeros(())  # until the first update
     started = time.monotonic() - counters.seconds
     save_time = window_time = time.monotonic()
     window_frames, stops, due = counters.frames, 0, 0
@@ -647,9 +654,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             last = info["final_obs"][i] if ended[i] else x[i]
             s_next = (*s[i][1:], lz4.block.compress(last))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
-            s[i] = (lz4.block.compress(x[i]),) * len(s_next) if ended[i] else s_next
+            first = (lz4.block.compress(x[i]),) * args.agent_history_length
+            s[i] = first if ended[i] else s_next
 
-        # The processes agree on the number of episodes, and whether to stop.
+        # The processes agree on the number of episodes, and whether one of them is to stop.
         sums = torch.tensor([ended.sum(), len(stop)])
         if ranks > 1:
             distributed.all_reduce(sums)
@@ -696,12 +704,12 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     if rank == 0:
         save()
     if ranks > 1:
-        distributed.barrier()  # all is saved: torchrun ends the others when the first has ended
+        distributed.barrier()  # not before number 0 has saved: now the others may end
         distributed.destroy_process_group()
     if stops:
         if rank == 0:
             print(f"frame {counters.frames:,}; go on with --resume {run_dir}")
-        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])
+        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])  # or: another process was to stop
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
     if rank == 0:
@@ -724,7 +732,8 @@ def main(args: Args) -> None:
     # [seed, number] are the seeds of the evaluations.
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
-    # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead.
+    # Not "fork": the copy of a process whose threads hold locks can hang. A server without threads,
+    # which has imported these modules, forks instead.
     multiprocessing.set_forkserver_preload(["torch.utils.tensorboard", "gymnasium", "tyro"])
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)

@@ -85,11 +85,11 @@ class Args:
 
 # ---- problem: the Atari environment and its wrappers ---------------------------------------------
 #
-#   emulator frame   1  2  3  4  5  6  7  8  9 10 11 12   60 a second
-#   action           a₁ ────────  a₂ ────────  a₃ ─────── repeated 4 times, rewards summed
-#   max-pool               3∨4         7∨8       11∨12    some sprites are drawn every other frame
-#   frame          x₀       x₁          x₂          x₃    grey, 84×84: the agent's unit of time
-#   state           (x₀,x₀,x₀,x₁) (x₀,x₀,x₁,x₂) (x₀,x₁,x₂,x₃)
+#   emulator frame  0 │ 1  2  3  4 │ 5  6  7  8 │ 9 10 11 12    60 a second
+#   action            │ a₀ ─────── │ a₁ ─────── │ a₂ ────────   repeated 4 times, rewards summed
+#   max-pool          │       3∨4  │       7∨8  │      11∨12    some sprites are in every other one
+#   frame           x₀│         x₁ │         x₂ │         x₃    grey, 84×84: the unit of time
+#   state             s₀ = (x₀, x₀, x₀, x₀), s₁ = (x₀, x₀, x₀, x₁), s₂ = (x₀, x₀, x₁, x₂), …
 
 
 class JoystickActions(gym.ActionWrapper):
@@ -199,7 +199,7 @@ class QNetwork(nn.Module):
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # 84 -> 20 -> 9 -> 7
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # of the screen: 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(
             nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
@@ -211,7 +211,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # Q keeps float32's digits
+        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -237,7 +237,7 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         if ":" in trained.env_id or max(no_ops, repeat) > 100:
             raise ValueError("its game is a module's, or is over before it can be played")
         shape = trained.environment_state_height, trained.environment_state_width
-        with torch.device("meta"):  # shapes alone, until they are known to be the file's
+        with torch.device("meta"):  # shapes without memory, until they are seen to be the file's
             q_network = QNetwork(trained.agent_history_length, *shape, len(trained.actions))
         q_network.load_state_dict(content["q_network"], assign=True)
         q_network.float()  # published weights may be in half precision
@@ -288,7 +288,7 @@ def play(env: gym.Env, q_network: QNetwork, trained, epsilon: float, rng, seed: 
 def largest_jumps(values: np.ndarray, count: int = 3) -> list[int]:
     """The frames t, in order of time, of the `count` largest |V(s_t) - V(s_{t-1})| of values (T,).
     They lie a second apart, or one event would fill all, and each has a frame before and after."""
-    changes = np.abs(np.diff(values))[:-1]  # (T - 2,), into frames 1 to T - 2
+    changes = np.abs(np.diff(values))[:-1]  # (T - 2,): index t - 1 is the jump into frame t
     moments = []
     for t in 1 + np.argsort(-changes, kind="stable"):
         if len(moments) < count and all(abs(t - m) >= FRAMES_PER_SECOND for m in moments):

@@ -67,12 +67,15 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
-#     sG has no row, no column, and V = 0.
-# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
-# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
-#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
+# `arrays`, below, makes of it P (rows, S), sparse, R (rows,) and first_row (S,). Figure 5:
+#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')    first_row
+#     s0, a1         .    1    .    10                                0
+#     s0, a2         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
+#     s1, a1         .    .    .     1                                2
+#     s2, a1         .    .    .     1                                3
+#     s2, a2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
+# A row is a pair (s, a). A transition that terminates is left out of P, for nothing comes after it.
+# So a row's sum is the chance to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: exhaustive search ----------------------------------------------------------------
@@ -80,22 +83,25 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 
 def policies(P: sparse.csr_array, first_row: np.ndarray, start: np.ndarray) -> Iterator[np.ndarray]:
     """Every policy (S,) int once: a row for each state that it reaches, -1 elsewhere."""
-    ends = np.append(first_row[1:], P.shape[0])  # (S,)
+    stops = np.append(first_row[1:], P.shape[0])  # (S,) one past the last row of each state
     stack = [np.full(len(first_row), -1)]
     while stack:
         policy = stack.pop()
+        # Actions are chosen in states that it reaches alone: all that they lead to is reached.
         reached = (start > 0) | (P[policy[policy >= 0]].sum(axis=0) > 0)  # (S,)
         undecided = np.flatnonzero(reached & (policy < 0))
         if len(undecided) == 0:
             yield policy
             continue
         s = undecided[0]
-        for row in reversed(range(first_row[s], ends[s])):
-            stack.append(np.where(np.arange(len(policy)) == s, row, policy))
+        for row in reversed(range(first_row[s], stops[s])):  # so the first action is popped first
+            stack.append(policy.copy())
+            stack[-1][s] = row
 
 
 def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndarray, int, int]:
-    """V^π (S,) of π (S,), its sweeps from `warm` (S,) and from V = 0; NaN where π never comes."""
+    """Of π (S,): V^π (S,), which is NaN where π never comes, the number of sweeps that it took from
+    `warm` (S,), and how many it takes from V = 0."""
     states = np.flatnonzero(policy >= 0)  # (n,)
     P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
@@ -115,11 +121,12 @@ def exhaustive_search(P, R, first_row, start: np.ndarray, args: Args) -> tuple:
     candidates = list(itertools.islice(policies(P, first_row, start), args.max_policies + 1))
     if len(candidates) > args.max_policies:
         raise SystemExit(f"error: there are more than {args.max_policies} policies")
-    current_max, best, tried, warm = -np.inf, None, [], np.zeros(len(start))  # warm: (S,)
+    current_max, best, tried = -np.inf, None, []
+    warm = np.zeros(len(start))  # (S,) where the next evaluation starts
     for policy in tqdm(candidates, "exhaustive search", unit=" policies", delay=2, leave=False):
         V, sweeps, sweeps_from_0 = evaluate_policy(P, R, policy, warm, args)  # Algorithm 2, line 5
-        warm = np.where(policy >= 0, V, warm)  # what the policies have in common is known
-        value = start[start > 0] @ V[start > 0]
+        warm = np.where(policy >= 0, V, warm)  # close, for policies have much in common
+        value = start[start > 0] @ V[start > 0]  # elsewhere V may be NaN
         tried.append((value, sweeps, sweeps_from_0))
         if current_max < value:  # lines 6-9
             current_max, best = value, (policy, V)
@@ -147,7 +154,7 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: where a `goal` (n,) bool may be reached by P (n, n), by a fixed point."""
+    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
     reached, before = goal, None
     while not np.array_equal(reached, before):
         reached, before = reached | (P @ reached > 0), reached
@@ -163,9 +170,10 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
     live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
-        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
+        raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
 
 
@@ -184,10 +192,11 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
-            kwargs = (item.split("=") for item in args.env_kwargs.split())
-            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
+            items = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
+        # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         if not model:
             raise ValueError("no state has an action")
@@ -201,7 +210,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
     Exits with one line if a state and action make no sense.
     """
-    number = {s: i for i, s in enumerate(model)}
+    column = {s: i for i, s in enumerate(model)}
     rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
@@ -209,20 +218,23 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             p, _, rewards, _ = zip(*transitions, strict=True)
             if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
                 raise ValueError
-            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
             raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each, which may be 0
+    # Two ways from a pair (s, a) to the same state are added up.
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    # The first row of a state is the number of actions of the states before it.
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
-    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`. NaN is undefined. The
+    Bellman residual is the largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| of a policy."""
     actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
-    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
-    q = iter(Q)
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))  # JSON has no NaN
+    q = iter(Q)  # goes through the rows
     solution = {
         "values": dict(zip(model, V, strict=True)),
         "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},

@@ -58,12 +58,15 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
-#     sG has no row, no column, and V = 0.
-# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
-# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
-#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
+# `arrays`, below, makes of it P (rows, S), sparse, R (rows,) and first_row (S,). Figure 5:
+#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')    first_row
+#     s0, a1         .    1    .    10                                0
+#     s0, a2         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
+#     s1, a1         .    .    .     1                                2
+#     s2, a1         .    .    .     1                                3
+#     s2, a2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
+# A row is a pair (s, a). A transition that terminates is left out of P, for nothing comes after it.
+# So a row's sum is the chance to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: linear program -------------------------------------------------------------------
@@ -72,7 +75,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def linear_program(P, R, first_row: np.ndarray, discount: float) -> tuple[np.ndarray, int]:
     """Equation 27 as a linear program: V* (S,), and the solver's iterations.
 
-    The smallest V that is nowhere below a right side of Equation 27. Exits if there is none.
+    V* is the smallest V that satisfies all inequalities: in each state one of them is an equation.
+    Exits if there is none.
     """
     # min Σ_s V(s)  subject to  V(s) ≥ R(s, a) + γ Σ_s' P(s'|s, a) V(s')  for all s and a,
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
@@ -81,14 +85,16 @@ def linear_program(P, R, first_row: np.ndarray, discount: float) -> tuple[np.nda
     # float64 has 16 digits: beside a reward of 1e9, 1e-10 cannot be asked for.
     digits = float(np.clip(1e-16 * np.abs(R).max(), 1e-10, 1e-7))
     tolerances = {"primal_feasibility_tolerance": digits, "dual_feasibility_tolerance": 1e-10}
-    # Easy to get wrong: where the agent may stay for nothing V ≥ 0. At discount 1 its constraint,
-    # V(s) ≥ V(s), does not say so.
+    # Easy to get wrong: where the agent may stay for nothing V ≥ 0. At discount 1 the constraint of
+    # an action that stays in s for nothing, V(s) ≥ 0 + V(s), does not say so.
     idle = maximum(idle_rows(P, R, first_row, np.zeros(len(counts))), first_row)  # (S,)
     bounds = [(0 if rests else None, None) for rests in idle]  # (S, 2)
     program = optimize.linprog(
         np.ones(len(counts)), discount * P - E, -R, bounds=bounds, options=tolerances
     )
-    if program.x is None:  # infeasible: V* is +∞ somewhere; unbounded: -∞
+    # Infeasible: no finite V is large enough, V* is +∞ somewhere. Unbounded: somewhere none is too
+    # small, V* is -∞.
+    if program.x is None:
         raise SystemExit(f"error: V* is not found: {program.message.splitlines()[0]}")
     return program.x, int(program.nit)  # (S,)
 
@@ -103,9 +109,9 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
     """max_a Q(s, a): (rows,) → (S,)."""
     width, rest = divmod(len(Q), len(first_row))
     if rest == 0 and (first_row == width * np.arange(len(first_row))).all():
-        # As many actions in every state: the same, by whole columns, is much quicker.
+        # Every state has `width` actions: the same as below, action by action, is much quicker.
         return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,)
-    return np.maximum.reduceat(Q, first_row)  # (S,) the maximum of each state's rows
+    return np.maximum.reduceat(Q, first_row)  # (S,) over rows first_row[s] to first_row[s + 1] - 1
 
 
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,20 +120,21 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     # π*(s) = argmax_a Q*(s, a)  Equation 31
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So value
-    # iteration decides again, over the tied actions alone, with 1 for an end and discount 0.995.
+    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So a second
+    # MDP decides, by value iteration again: the tied actions alone, an end is worth 1, γ = 0.995.
     idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
-    near, before = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
-        near, before = maximum(nearness, first_row), near  # (S,)
-    rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)], near > 0  # the first such row of each state
+    V_end, V_old = np.zeros(len(V)), None  # (S,)
+    while not np.array_equal(V_end, V_old):
+        # Resting is an end, too.
+        Q_end = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ V_end), -1)  # (rows,)
+        V_end, V_old = maximum(Q_end, first_row), V_end  # (S,)
+    rows = np.flatnonzero(Q_end >= np.repeat(V_end * (1 - 1e-9), counts))  # the best, of all states
+    return rows[np.searchsorted(rows, first_row)], V_end > 0  # the first of them in each state
 
 
 def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """(rows,) bool: idle actions, after which the agent may go on for ever, or end, without any
-    reward. They lead only to states where V (S,) is 0 and some action is idle again."""
+    """(rows,) bool: idle actions. Their expected reward is 0, and they end or lead to states alone
+    where V (S,) is 0 and some action is idle again: the agent may rest there for ever."""
     idle, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(idle, before):
         rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
@@ -150,10 +157,11 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
-            kwargs = (item.split("=") for item in args.env_kwargs.split())
-            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
+            items = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
+        # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         if not model:
             raise ValueError("no state has an action")
@@ -167,7 +175,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
     Exits with one line if a state and action make no sense.
     """
-    number = {s: i for i, s in enumerate(model)}
+    column = {s: i for i, s in enumerate(model)}
     rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
@@ -175,12 +183,14 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             p, _, rewards, _ = zip(*transitions, strict=True)
             if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
                 raise ValueError
-            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
             raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each, which may be 0
+    # Two ways from a pair (s, a) to the same state are added up.
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    # The first row of a state is the number of actions of the states before it.
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
@@ -192,10 +202,11 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
-    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`. NaN is undefined. The
+    Bellman residual is the largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| of a policy."""
     actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
-    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
-    q = iter(Q)
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))  # JSON has no NaN
+    q = iter(Q)  # goes through the rows
     solution = {
         "values": dict(zip(model, V, strict=True)),
         "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},

@@ -19,8 +19,8 @@ Measured
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
-    At discount 1 V is 0 where nothing more is collected; a policy that may never end has no value.
-    V is undefined where the policy never comes. A terminal state has V = 0 and no column.
+    At discount 1 V is 0 where nothing more is collected; a policy that may collect for ever has no
+    value. V is undefined where the policy never comes.
 """
 
 import json
@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V and rewards have the same unit; an iteration is a sweep over all states."""
+    """V and rewards have the same unit; a sweep is over all states."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -69,15 +69,35 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
-#     sG has no row, no column, and V = 0.
-# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
-# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
-#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
+# `arrays`, below, makes of it P (rows, S), sparse, R (rows,) and first_row (S,). Figure 5:
+#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')    first_row
+#     s0, a1         .    1    .    10                                0
+#     s0, a2         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
+#     s1, a1         .    .    .     1                                2
+#     s2, a1         .    .    .     1                                3
+#     s2, a2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
+# A row is a pair (s, a). A transition that terminates is left out of P, for nothing comes after it.
+# So a row's sum is the chance to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: policy evaluation ----------------------------------------------------------------
+
+
+def policy_evaluation(P, R, policy, args: Args) -> tuple[np.ndarray, np.ndarray, int]:
+    """V^π (S,) by Algorithm 1, V^π (S,) by the linear system, and the number of sweeps.
+
+    π (S,) int is a row for each state that it reaches. Elsewhere it is -1, and V is NaN.
+    """
+    states = np.flatnonzero(policy >= 0)  # (n,)
+    P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
+    live = live_states(P_π, R_π, args.discount)  # (n,)
+    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
+    V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
+    exact, zeros = V.copy(), np.zeros(len(states))  # (S,), (n,)
+    limits = args.discount, args.tolerance, args.max_iterations
+    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, zeros, *limits)
+    exact[states] = solve_system(P_π, R_π, args.discount)
+    return V, exact, sweeps
 
 
 def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
@@ -97,11 +117,11 @@ def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
-    if len(R) > 1000:  # a factorization of a random graph fills in; this needs A @ V alone
+    if len(R) > 1000:  # a large system: approach V step by step, which is quick; else solve exactly
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R) if len(R) else R  # (n,)
+    return linalg.spsolve(A, R) if len(R) else R  # (n,), which may be 0
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
@@ -111,7 +131,7 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: where a `goal` (n,) bool may be reached by P (n, n), by a fixed point."""
+    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
     reached, before = goal, None
     while not np.array_equal(reached, before):
         reached, before = reached | (P @ reached > 0), reached
@@ -127,9 +147,10 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
     live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
-        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
+        raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
 
 
@@ -148,10 +169,11 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
-            kwargs = (item.split("=") for item in args.env_kwargs.split())
-            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
+            items = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
+        # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         if not model:
             raise ValueError("no state has an action")
@@ -165,7 +187,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
     Exits with one line if a state and action make no sense.
     """
-    number = {s: i for i, s in enumerate(model)}
+    column = {s: i for i, s in enumerate(model)}
     rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
@@ -173,20 +195,22 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             p, _, rewards, _ = zip(*transitions, strict=True)
             if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
                 raise ValueError
-            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
             raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each, which may be 0
+    # Two ways from a pair (s, a) to the same state are added up.
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    # The first row of a state is the number of actions of the states before it.
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int, a row for each state, from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}, without =
     rows = {pair: row for row, pair in enumerate((s, a) for s in model for a in model[s])}
-    if unknown := chosen.items() - rows.keys():
+    if unknown := chosen.items() - rows.keys():  # pairs (s, a)
         raise SystemExit(f"error: {unknown} names no state and action of this model")
     return np.array([rows[s, chosen[s]] if s in chosen else -1 for s in model])
 
@@ -202,15 +226,16 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
     """Print the first ten rows in columns that line up, with i = 0, 1, ... before them."""
     lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows[:10]))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    texts = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
-    print("\n".join(texts), end="\n\n")
+    for line in [*lines, []]:
+        print("  ".join(map(str.ljust, line, widths)).rstrip())
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
-    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`. NaN is undefined. The
+    Bellman residual is the largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| of a policy."""
     actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
-    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
-    q = iter(Q)
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))  # JSON has no NaN
+    q = iter(Q)  # goes through the rows
     solution = {
         "values": dict(zip(model, V, strict=True)),
         "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},
@@ -227,16 +252,15 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 
 
 def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: int) -> None:
-    """Equation 3 of the states that π (S,) reaches, its solution (S,), and the lecture's table of
-    the sweeps."""
+    """Equation 3 of the states that π (S,) reaches, its solution `exact` (S,), and the lecture's
+    table of the first sweeps. π is -1 where it never comes."""
     rows = [transitions for actions in model.values() for transitions in actions.values()]
     chosen = {s: rows[row] for s, row in zip(model, policy, strict=True) if row >= 0}
     unknowns = {s: f"V({s})" for s in model}
-    for s, v in zip(model, exact, strict=True):
-        if s in chosen:
-            fraction = Fraction(v).limit_denominator(1_000_000)
-            text = fraction if np.isclose(float(fraction), v, rtol=1e-12, atol=0) else f"{v:.12g}"
-            print(f"V({s}) = {worked(chosen[s], discount, unknowns)} = {text}")
+    for s, v in zip(chosen, exact[policy >= 0], strict=True):
+        fraction = Fraction(v).limit_denominator(1_000_000)
+        text = fraction if np.isclose(float(fraction), v, rtol=1e-12, atol=0) else f"{v:.12g}"
+        print(f"V({s}) = {worked(chosen[s], discount, unknowns)} = {text}")
     print()
     table, V = [["0"] * len(chosen)], np.zeros(len(model))  # (S,)
     for _ in range(min(sweeps, 9)):  # once more, to be printed
@@ -254,30 +278,24 @@ def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
     model, env = read_model(args)
     P, R, first_row = arrays(model)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,)
-    lecture = ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]  # π1, π2, π3 of §3.2
-    for text in [args.policy] if args.policy or args.model or args.env_id else lecture:
-        policy = read_policy(text, model) if text else first_row  # (S,)
-        # The policy graph (§3.2): what may be reached from the start, so P is transposed. A row of
-        # -1 is the last of P; if its state is reached, that is an error anyway.
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else: the first
+    named = args.policy or args.model or args.env_id  # else π1, π2 and π3 of §3.2
+    texts = [args.policy] if named else ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]
+    for text in texts:
+        policy = read_policy(text, model) if text else first_row  # (S,) else: the first actions
+        # The policy graph (§3.2): the states that may be reached from the start, so P is turned
+        # round. Where π is -1, P[-1] does no harm: to come there at all is an error.
         reached = may_reach(P[policy].T, start > 0)  # (S,)
         if policy[reached].min() < 0:
             raise SystemExit("error: --policy comes to a state for which it names no action")
-        policy, states = np.where(reached, policy, -1), np.flatnonzero(reached)  # (S,), (n,)
-        P_π, R_π = P[policy[states]][:, states], R[policy[states]]  # (n, n), (n,)
-        live = live_states(P_π, R_π, args.discount)  # (n,)
-        P_π, R_π = P_π[live][:, live], R_π[live]
-        limits = args.discount, args.tolerance, args.max_iterations
-        V = np.where(reached, 0.0, np.nan)  # (S,)
-        V[states[live]], sweeps = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
-        exact = V.copy()  # (S,)
-        exact[states[live]] = solve_system(P_π, R_π, args.discount)
+        policy = np.where(reached, policy, -1)  # (S,)
+        V, exact, sweeps = policy_evaluation(P, R, policy, args)
         if len(R) <= 12:  # small enough to be worked through on paper
             print_evaluation(model, P, R, policy, args.discount, exact, sweeps)
         Q = backup(P, R, V, args.discount)  # (rows,)
-        residual = np.abs(Q[policy[states]] - V[states]).max()
+        residual = np.abs(Q[policy] - V)[reached].max()
         report(args.output_json, model, V, Q, policy, sweeps, residual)
-        print(f"The linear system differs by {np.abs(V - exact)[states].max():.2g}\n")
+        print(f"The linear system differs by {np.abs(V - exact)[reached].max():.2g}\n")
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ Measured
 
 Deviations
     An action is changed only for a gain: of actions that tie, an argmax may change for ever.
-    Not a random policy but, without --initial-policy, one that ends or rests where it can: at
-    discount 1 another has no value.
+    The first policy is not random but, without --initial-policy, one that ends, or stays somewhere
+    for nothing, if it can: at discount 1 another has no value.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
@@ -66,12 +66,15 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# P (rows, S), sparse: P(s'|s, a) of every pair (s, a), a row, in order of state. A transition that
-#     terminates is left out, for nothing comes after it. So a row's sum is the chance to go on, and
-#     sG has no row, no column, and V = 0.
-# R (rows,): Σ_s' P(s'|s, a) R(s, a, s').
-# first_row (S,) int: where the rows of each state begin, 0, 2 and 3 in Figure 5, whose rows are
-#     (s0, a1), (s0, a2), (s1, a1), (s2, a1), (s2, a2).
+# `arrays`, below, makes of it P (rows, S), sparse, R (rows,) and first_row (S,). Figure 5:
+#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')    first_row
+#     s0, a1         .    1    .    10                                0
+#     s0, a2         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
+#     s1, a1         .    .    .     1                                2
+#     s2, a1         .    .    .     1                                3
+#     s2, a2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
+# A row is a pair (s, a). A transition that terminates is left out of P, for nothing comes after it.
+# So a row's sum is the chance to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: policy iteration -----------------------------------------------------------------
@@ -87,9 +90,9 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
     """max_a Q(s, a): (rows,) → (S,)."""
     width, rest = divmod(len(Q), len(first_row))
     if rest == 0 and (first_row == width * np.arange(len(first_row))).all():
-        # As many actions in every state: the same, by whole columns, is much quicker.
+        # Every state has `width` actions: the same as below, action by action, is much quicker.
         return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,)
-    return np.maximum.reduceat(Q, first_row)  # (S,) the maximum of each state's rows
+    return np.maximum.reduceat(Q, first_row)  # (S,) over rows first_row[s] to first_row[s + 1] - 1
 
 
 def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=1000) -> list[tuple]:
@@ -101,8 +104,9 @@ def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=10
     steps = []
     for _ in tqdm(range(max_iterations), "policy iteration", delay=2, leave=False):
         # Perform policy evaluation on π to find V^π(s)  Algorithm 4, line 3
-        live, V = live_states(P[policy], R[policy], discount), np.zeros(len(policy))  # (S,)
-        V[live] = solve_system(P[policy[live]][:, live], R[policy[live]], discount)
+        P_π, R_π = P[policy], R[policy]  # (S, S), (S,)
+        live, V = live_states(P_π, R_π, discount), np.zeros(len(policy))  # (S,), (S,)
+        V[live] = solve_system(P_π[live][:, live], R_π[live], discount)
         Q = backup(P, R, V, discount)  # (rows,)
         steps.append((policy, V, Q))
         # π(s) = argmax_a Q^π(s, a)  Algorithm 4, line 5
@@ -118,15 +122,15 @@ def policy_iteration(P, R, first_row, policy, discount: float, max_iterations=10
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
-    if len(R) > 1000:  # a factorization of a random graph fills in; this needs A @ V alone
+    if len(R) > 1000:  # a large system: approach V step by step, which is quick; else solve exactly
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R) if len(R) else R  # (n,)
+    return linalg.spsolve(A, R) if len(R) else R  # (n,), which may be 0
 
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: where a `goal` (n,) bool may be reached by P (n, n), by a fixed point."""
+    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
     reached, before = goal, None
     while not np.array_equal(reached, before):
         reached, before = reached | (P @ reached > 0), reached
@@ -142,9 +146,10 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
     live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
-        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
+        raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
 
 
@@ -154,20 +159,21 @@ def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarra
     # π*(s) = argmax_a Q*(s, a)  Equation 31
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So value
-    # iteration decides again, over the tied actions alone, with 1 for an end and discount 0.995.
+    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So a second
+    # MDP decides, by value iteration again: the tied actions alone, an end is worth 1, γ = 0.995.
     idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
-    near, before = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(near, before):
-        nearness = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ near), -1)  # (rows,)
-        near, before = maximum(nearness, first_row), near  # (S,)
-    rows = np.flatnonzero(nearness >= np.repeat(near * (1 - 1e-9), counts))
-    return rows[np.searchsorted(rows, first_row)], near > 0  # the first such row of each state
+    V_end, V_old = np.zeros(len(V)), None  # (S,)
+    while not np.array_equal(V_end, V_old):
+        # Resting is an end, too.
+        Q_end = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ V_end), -1)  # (rows,)
+        V_end, V_old = maximum(Q_end, first_row), V_end  # (S,)
+    rows = np.flatnonzero(Q_end >= np.repeat(V_end * (1 - 1e-9), counts))  # the best, of all states
+    return rows[np.searchsorted(rows, first_row)], V_end > 0  # the first of them in each state
 
 
 def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """(rows,) bool: idle actions, after which the agent may go on for ever, or end, without any
-    reward. They lead only to states where V (S,) is 0 and some action is idle again."""
+    """(rows,) bool: idle actions. Their expected reward is 0, and they end or lead to states alone
+    where V (S,) is 0 and some action is idle again: the agent may rest there for ever."""
     idle, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(idle, before):
         rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
@@ -190,10 +196,11 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
         if args.model:
             model = json.loads(args.model.read_text("utf-8"))
         if args.env_id:
-            kwargs = (item.split("=") for item in args.env_kwargs.split())
-            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
+            items = (item.split("=") for item in args.env_kwargs.split())
+            kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             env = gym.make(args.env_id, **kwargs).unwrapped
             model = env.P
+        # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         if not model:
             raise ValueError("no state has an action")
@@ -207,7 +214,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
 
     Exits with one line if a state and action make no sense.
     """
-    number = {s: i for i, s in enumerate(model)}
+    column = {s: i for i, s in enumerate(model)}
     rows = [(s, a, t) for s in model for a, t in model[s].items()]
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
@@ -215,20 +222,22 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
             p, _, rewards, _ = zip(*transitions, strict=True)
             if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
                 raise ValueError
-            entries += [(q, row, number[str(n)]) for q, n, _, end in transitions if q and not end]
+            entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
             raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each
+    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each, which may be 0
+    # Two ways from a pair (s, a) to the same state are added up.
     P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
+    # The first row of a state is the number of actions of the states before it.
     return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int, a row for each state, from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}, without =
     rows = {pair: row for row, pair in enumerate((s, a) for s in model for a in model[s])}
-    if unknown := chosen.items() - rows.keys():
+    if unknown := chosen.items() - rows.keys():  # pairs (s, a)
         raise SystemExit(f"error: {unknown} names no state and action of this model")
     return np.array([rows[s, chosen[s]] if s in chosen else -1 for s in model])
 
@@ -244,8 +253,8 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
     """Print the first ten rows in columns that line up, with i = 0, 1, ... before them."""
     lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows[:10]))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    texts = ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
-    print("\n".join(texts), end="\n\n")
+    for line in [*lines, []]:
+        print("  ".join(map(str.ljust, line, widths)).rstrip())
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
@@ -256,10 +265,11 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
-    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`; NaN is undefined."""
+    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`. NaN is undefined. The
+    Bellman residual is the largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| of a policy."""
     actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
-    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))
-    q = iter(Q)
+    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))  # JSON has no NaN
+    q = iter(Q)  # goes through the rows
     solution = {
         "values": dict(zip(model, V, strict=True)),
         "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},
@@ -287,9 +297,9 @@ def main(args: Args) -> None:
         policy = read_policy(text, model)  # (S,)
     else:
         # Easy to get wrong: at discount 1 the first policy needs a value. It rests where that costs
-        # nothing, else it takes the shortest way to such a state or to the end.
+        # nothing. Elsewhere all actions tie, and the rule for ties takes the way that soonest ends.
         idle = idle_rows(P, R, first_row, np.zeros(len(model)))  # (rows,)
-        policy, _ = greedy_policy(P, R, first_row, idle - 1.0)  # as Q: 0 where idle, else -1
+        policy, _ = greedy_policy(P, R, first_row, Q=idle - 1.0)  # 0 where idle, else -1
     if policy.min() < 0:
         raise SystemExit("error: --initial-policy needs an action in every state")
     steps = policy_iteration(P, R, first_row, policy, args.discount, args.max_iterations)

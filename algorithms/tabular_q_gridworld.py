@@ -157,9 +157,9 @@ def make_world(args: Args) -> gym.Env:
     if args.env_id == "GridWorld":
         return gym.wrappers.TimeLimit(GridWorld(args.slip_probability, args.step_reward), 1000)
     try:
-        kwargs = (item.split("=") for item in args.env_kwargs.split())
-        kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in kwargs}
-        env = gym.make(args.env_id, disable_env_checker=True, **kwargs)
+        items = (item.split("=") for item in args.env_kwargs.split())
+        kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
+        env = gym.make(args.env_id, disable_env_checker=True, **kwargs)  # it costs time in step()
     except Exception as error:  # whatever the constructor of somebody's environment raises
         raise SystemExit(f"error: cannot make {args.env_id}: {error}") from None
     for space in (env.observation_space, env.action_space):
@@ -179,7 +179,7 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
     # Easy to get wrong: with one seed for both, the numbers that decide on exploration would be
     # the very numbers that make the robot slip. Hence two seeds from one.
     seeds = np.random.SeedSequence(args.seed).generate_state(2)  # (2,) uint32
-    random = np.random.default_rng(seeds[1]).random
+    random = np.random.default_rng(seeds[1]).random  # a function: a number in [0, 1)
     S, A = int(env.observation_space.n), int(env.action_space.n)
     Q = [[0.0] * A for _ in range(S)]  # lines 2-6; Python reads lists faster than arrays
     N = [[0] * A for _ in range(S)]  # N(s,a), visits
@@ -194,7 +194,7 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
                 a = int(random() * A)
             else:
                 best = max(Q[s])
-                ties = [a for a in range(A) if Q[s][a] == best]  # the first alone would go left
+                ties = [a for a in range(A) if Q[s][a] == best]  # at first all: no one goes first
                 a = ties[int(random() * len(ties))]
             s_next, r, terminated, truncated, _ = env.step(a)
 
