@@ -154,19 +154,19 @@ def read_args() -> Args:
     if args.resume:
         try:
             saved = json.loads((Path(args.resume) / "args.json").read_text())
-            defaults = Args(**saved)
+            defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
         args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
-        changed = {name for name, value in vars(args).items() if value != saved.get(name)}
         shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
-        if shorter or changed - {"resume", "environment_train_frames_max"}:
+        defaults.environment_train_frames_max = args.environment_train_frames_max
+        if shorter or args != defaults:
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
     # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
-        if type(value) in (int, float) and not low <= value <= (1 if share else math.inf):
+        if type(value) in (int, float) and not low <= value <= (1 if share else 2**31):
             raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
     if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
         raise SystemExit("error: --agent-replay-buffer-initial is above the maximum length")
@@ -288,7 +288,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     try:
         env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
                        full_action_space=False, max_num_frames_per_episode=108_000)
-    except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
+    except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
     no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
@@ -520,7 +520,6 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             break
     # what RecordEpisodeStatistics has counted so far
     unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
-    env.close()
     return finished, unfinished
 
 
@@ -540,13 +539,13 @@ class Counters:
 
 
 def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
-    """A row of evaluations.csv: mean and (population) variance of the games' scores and lengths,
-    the columns of Tables 4 to 6; NaN without a finished game."""
+    """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
+    columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
         row[f"{name}_mean"] = float(np.mean(values))
-        row[f"{name}_variance"] = float(np.var(values))
+        row[f"{name}_variance"] = float(np.var(values, ddof=min(1, len(values) - 1)))
     return row | {"seconds": round(counters.seconds, 1)}
 
 
@@ -781,7 +780,7 @@ def main(args: Args) -> None:
         print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
         raise SystemExit(128 + stop[0])
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
+        signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
     write_test(run_dir / "test.json", counters, finished, unfinished)
 
@@ -790,5 +789,5 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    except OSError as error:  # TensorBoard's files, on a full disk
-        raise SystemExit(f"error: {error}") from None
+    except (OSError, KeyboardInterrupt) as error:  # a full disk; Ctrl-C before or after the loop
+        raise SystemExit(f"error: {str(error) or 'interrupted'}") from None

@@ -6,8 +6,9 @@
 # ]
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
-§7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the
-choice of the precision, RMSProp and the count of dead units.
+§7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the lock
+on a run, the choice of the precision, RMSProp and the count of dead units. To
+--optimizer-learning-rate the flags are Table 3's, from --env-id on this script's own.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
     network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
@@ -52,6 +53,7 @@ import os
 import signal
 import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal
@@ -155,19 +157,19 @@ def read_args() -> Args:
     if args.resume:
         try:
             saved = json.loads((Path(args.resume) / "args.json").read_text())
-            defaults = Args(**saved)
+            defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
         args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
-        changed = {name for name, value in vars(args).items() if value != saved.get(name)}
         shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
-        if shorter or changed - {"resume", "environment_train_frames_max"}:
+        defaults.environment_train_frames_max = args.environment_train_frames_max
+        if shorter or args != defaults:
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
     # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
-        if type(value) in (int, float) and not low <= value <= (1 if share else math.inf):
+        if type(value) in (int, float) and not low <= value <= (1 if share else 2**31):
             raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
     if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
         raise SystemExit("error: --agent-replay-buffer-initial is above the maximum length")
@@ -289,7 +291,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     try:
         env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
                        full_action_space=False, max_num_frames_per_episode=108_000)
-    except (gym.error.Error, TypeError) as error:  # a TypeError: another kind of game
+    except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
     no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
@@ -472,7 +474,6 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             break
     # what RecordEpisodeStatistics has counted so far
     unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
-    env.close()
     return finished, unfinished
 
 
@@ -492,13 +493,13 @@ class Counters:
 
 
 def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
-    """A row of evaluations.csv: mean and (population) variance of the games' scores and lengths,
-    the columns of Tables 4 to 6; NaN without a finished game."""
+    """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
+    columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
         row[f"{name}_mean"] = float(np.mean(values))
-        row[f"{name}_variance"] = float(np.var(values))
+        row[f"{name}_variance"] = float(np.var(values, ddof=min(1, len(values) - 1)))
     return row | {"seconds": round(counters.seconds, 1)}
 
 
@@ -576,6 +577,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     if args.resume:
         path = Path(args.resume) / "checkpoint.pt"
         try:
+            if zipfile.ZipFile(path).testzip():
+                raise ValueError("a checksum is wrong")
             saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in it
             for name, part in parts.items():
                 part.load_state_dict(saved[name])
@@ -711,7 +714,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             print(f"frame {counters.frames:,}; go on with --resume {run_dir}")
         raise SystemExit(128 + (stop or [signal.SIGTERM])[0])  # or: another process was to stop
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)  # all is saved: the test may be cut off
+        signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     if rank == 0:
         finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
         write_test(run_dir / "test.json", counters, finished, unfinished)
@@ -727,7 +730,7 @@ def main(args: Args) -> None:
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
     if ranks > 1:  # gloo on CPUs, NCCL on GPUs; the others wait while number 0 evaluates
-        distributed.init_process_group(timeout=datetime.timedelta(hours=1))
+        distributed.init_process_group(timeout=datetime.timedelta(days=1))
 
     # [seed, number] are the seeds of the evaluations.
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
@@ -755,5 +758,5 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    except OSError as error:  # TensorBoard's files, on a full disk
-        raise SystemExit(f"error: {error}") from None
+    except (OSError, KeyboardInterrupt) as error:  # a full disk; Ctrl-C before or after the loop
+        raise SystemExit(f"error: {str(error) or 'interrupted'}") from None

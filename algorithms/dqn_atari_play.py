@@ -234,7 +234,7 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         trained = types.SimpleNamespace(**content["args"], actions=content["actions"])
         no_ops, repeat = trained.environment_no_op_max, trained.agent_action_repeat
         # Gymnasium would import what stands before a colon.
-        if ":" in trained.env_id or max(no_ops, repeat) > 100:
+        if ":" in trained.env_id or max(no_ops, repeat) > 10_000:
             raise ValueError("its game is a module's, or is over before it can be played")
         shape = trained.environment_state_height, trained.environment_state_width
         with torch.device("meta"):  # shapes without memory, until they are seen to be the file's
@@ -434,7 +434,7 @@ def main(args: Args) -> None:
         print(f"game {len(results)}: score {results[-1][0]:g}, {len(rows):,} frames")
     if args.games > 1:
         for name, values in zip(("score", "length"), np.transpose(results), strict=True):
-            print(f"{name:6}  mean {values.mean():.5g}, variance {values.var():.5g}")
+            print(f"{name:6}  mean {values.mean():.5g}, variance {values.var(ddof=1):.5g}")
         return
 
     folder = Path(args.output or path.parent / f"play-seed{args.seed}")

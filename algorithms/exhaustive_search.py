@@ -52,7 +52,8 @@ class Args:
     max_policies: int = 10_000
     """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
+    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -215,8 +216,9 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
-            p, _, rewards, _ = zip(*transitions, strict=True)
-            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+            p, _, rewards, ends = zip(*transitions, strict=True)
+            valid = min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and {*ends} <= {True, False}
+            if not (valid and np.isfinite(sum(rewards))):
                 raise ValueError
             entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
@@ -247,6 +249,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
     print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 

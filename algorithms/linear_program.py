@@ -36,7 +36,8 @@ from scipy import optimize, sparse
 
 @dataclass
 class Args:
-    """V, Q and rewards have the same unit; an iteration is one of the solver."""
+    """V, Q and rewards have the same unit; an iteration is one of the solver,
+    which may find the solution before its first one."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -114,22 +115,27 @@ def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
     return np.maximum.reduceat(Q, first_row)  # (S,) over rows first_row[s] to first_row[s + 1] - 1
 
 
+def argmax(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
+    """argmax_a Q(s, a): (rows,) → (S,) int, the first best row of each state."""
+    counts = np.diff(first_row, append=len(Q))  # (S,) |A_s|
+    rows = np.flatnonzero(Q == np.repeat(maximum(Q, first_row), counts))  # the best of all states
+    return rows[np.searchsorted(rows, first_row)]
+
+
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
-    tie, π takes one that soonest ends, or comes to rest for nothing."""
-    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    """At discount 1: π (S,) int, a row for each state, and where it may end (S,) bool. Of the best
+    actions that tie, π takes one that soonest ends, or rests for nothing."""
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So a second
-    # MDP decides, by value iteration again: the tied actions alone, an end is worth 1, γ = 0.995.
-    idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
+    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
+    # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
+    rests = (np.abs(R) <= 1e-9) & (P @ (np.abs(V) > 1e-9) == 0)  # (rows,) an end, too: V stays 0
+    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) the chance to end
     V_end, V_old = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(V_end, V_old):
-        # Resting is an end, too.
-        Q_end = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ V_end), -1)  # (rows,)
+        Q_end = np.where(tied, 0.995 * np.where(rests, 1, ends + P @ V_end), -1)  # (rows,)
         V_end, V_old = maximum(Q_end, first_row), V_end  # (S,)
-    rows = np.flatnonzero(Q_end >= np.repeat(V_end * (1 - 1e-9), counts))  # the best, of all states
-    return rows[np.searchsorted(rows, first_row)], V_end > 0  # the first of them in each state
+    return argmax(Q_end, first_row), V_end > 0
 
 
 def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
@@ -180,8 +186,9 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
-            p, _, rewards, _ = zip(*transitions, strict=True)
-            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+            p, _, rewards, ends = zip(*transitions, strict=True)
+            valid = min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and {*ends} <= {True, False}
+            if not (valid and np.isfinite(sum(rewards))):
                 raise ValueError
             entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
@@ -219,6 +226,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
     print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
@@ -238,7 +246,10 @@ def main(args: Args) -> None:
             for transitions in actions.values():
                 print(f"V({s}) ≥ {worked(transitions, args.discount, unknowns)}")
         print()
-    policy, _ = greedy_policy(P, R, first_row, Q)
+    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    policy = argmax(Q, first_row)  # (S,) int, rows
+    if args.discount == 1:
+        policy, _ = greedy_policy(P, R, first_row, Q)
     residual = np.abs(maximum(Q, first_row) - V).max()
     report(args.output_json, model, V, Q, policy, iterations, residual)
 

@@ -54,7 +54,8 @@ class Args:
     policy: str = ""
     """such as "s0=a2 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
+    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -192,8 +193,9 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
-            p, _, rewards, _ = zip(*transitions, strict=True)
-            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+            p, _, rewards, ends = zip(*transitions, strict=True)
+            valid = min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and {*ends} <= {True, False}
+            if not (valid and np.isfinite(sum(rewards))):
                 raise ValueError
             entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
@@ -223,8 +225,8 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """Print the first ten rows in columns that line up, with i = 0, 1, ... before them."""
-    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows[:10]))]
+    """Print the rows in columns that line up, with i = 0, 1, ... before them."""
+    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in [*lines, []]:
         print("  ".join(map(str.ljust, line, widths)).rstrip())
@@ -248,6 +250,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
     print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
@@ -258,7 +261,7 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
     chosen = {s: rows[row] for s, row in zip(model, policy, strict=True) if row >= 0}
     unknowns = {s: f"V({s})" for s in model}
     for s, v in zip(chosen, exact[policy >= 0], strict=True):
-        fraction = Fraction(v).limit_denominator(1_000_000)
+        fraction = Fraction(v).limit_denominator(10_000)
         text = fraction if np.isclose(float(fraction), v, rtol=1e-12, atol=0) else f"{v:.12g}"
         print(f"V({s}) = {worked(chosen[s], discount, unknowns)} = {text}")
     print()

@@ -19,7 +19,8 @@ Measured
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
     Of actions that tie, the policy takes one that ends soonest: at discount 1 an argmax may walk to
-    and fro for ever.
+    and fro for ever. Where V is held up at discount 1 (from V_0 = 0, costs may be seen later than a
+    way to stay for nothing), it is not V*: that is an error.
     A transition that terminates adds no V(s'): a terminal state needs no entry in a model. Where
     one has (FrozenLake's holes and goal), its V means nothing.
 """
@@ -53,7 +54,8 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1)"""
+    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
+    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -117,32 +119,27 @@ def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_itera
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
+def argmax(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
+    """argmax_a Q(s, a): (rows,) → (S,) int, the first best row of each state."""
+    counts = np.diff(first_row, append=len(Q))  # (S,) |A_s|
+    rows = np.flatnonzero(Q == np.repeat(maximum(Q, first_row), counts))  # the best of all states
+    return rows[np.searchsorted(rows, first_row)]
+
+
 def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """π (S,) int, a row for each state, and where it may end (S,) bool. Of the best actions that
-    tie, π takes one that soonest ends, or comes to rest for nothing."""
-    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    """At discount 1: π (S,) int, a row for each state, and where it may end (S,) bool. Of the best
+    actions that tie, π takes one that soonest ends, or rests for nothing."""
     V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
     tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
-    # Easy to get wrong: at discount 1 walking to and fro ties with walking to the goal. So a second
-    # MDP decides, by value iteration again: the tied actions alone, an end is worth 1, γ = 0.995.
-    idle, ends = idle_rows(P, R, first_row, V), (1 - P.sum(axis=1)).round(8)  # (rows,)
+    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
+    # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
+    rests = (np.abs(R) <= 1e-9) & (P @ (np.abs(V) > 1e-9) == 0)  # (rows,) an end, too: V stays 0
+    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) the chance to end
     V_end, V_old = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(V_end, V_old):
-        # Resting is an end, too.
-        Q_end = np.where(tied, 0.995 * np.where(idle, 1, ends + P @ V_end), -1)  # (rows,)
+        Q_end = np.where(tied, 0.995 * np.where(rests, 1, ends + P @ V_end), -1)  # (rows,)
         V_end, V_old = maximum(Q_end, first_row), V_end  # (S,)
-    rows = np.flatnonzero(Q_end >= np.repeat(V_end * (1 - 1e-9), counts))  # the best, of all states
-    return rows[np.searchsorted(rows, first_row)], V_end > 0  # the first of them in each state
-
-
-def idle_rows(P, R, first_row: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """(rows,) bool: idle actions. Their expected reward is 0, and they end or lead to states alone
-    where V (S,) is 0 and some action is idle again: the agent may rest there for ever."""
-    idle, before = np.abs(V) <= 1e-9, None  # (S,)
-    while not np.array_equal(idle, before):
-        rows = (np.abs(R) <= 1e-9) & (P @ (~idle) == 0)  # (rows,)
-        idle, before = idle & maximum(rows, first_row), idle
-    return rows
+    return argmax(Q_end, first_row), V_end > 0
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
@@ -183,8 +180,9 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     entries, R = [], []
     for row, (s, a, transitions) in enumerate(rows):
         try:
-            p, _, rewards, _ = zip(*transitions, strict=True)
-            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(rewards).all()):
+            p, _, rewards, ends = zip(*transitions, strict=True)
+            valid = min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and {*ends} <= {True, False}
+            if not (valid and np.isfinite(sum(rewards))):
                 raise ValueError
             entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
             R.append(np.dot(p, rewards))
@@ -205,8 +203,8 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """Print the first ten rows in columns that line up, with i = 0, 1, ... before them."""
-    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows[:10]))]
+    """Print the rows in columns that line up, with i = 0, 1, ... before them."""
+    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows))]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in [*lines, []]:
         print("  ".join(map(str.ljust, line, widths)).rstrip())
@@ -237,6 +235,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
         print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
     print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
 
 
@@ -254,6 +253,7 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
             y, x = divmod(s, cells.shape[1])
             # 4 actions a state, so row % 4 is the action
             axes.text(x, y, arrows[policy[s] % 4], ha="center", va="center", fontsize=16)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png", dpi=120)
 
 
@@ -267,10 +267,13 @@ def main(args: Args) -> None:
     limits = args.discount, args.tolerance, args.max_iterations
     V, changes = value_iteration(P, R, first_row, *limits)
     Q = backup(P, R, V, args.discount)  # (rows,)
-    policy, ends = greedy_policy(P, R, first_row, Q)
-    # V may be held up by a loop whose rewards cancel: from s +1 to t, from t -1 to s, and no end.
-    if args.discount == 1 and (np.abs(V[~ends]) > 1e-9).any():
-        raise SystemExit("error: V* is not found: there is a loop without end, and without reward")
+    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    policy = argmax(Q, first_row)  # (S,) int, rows
+    if args.discount == 1:
+        policy, ends = greedy_policy(P, R, first_row, Q)
+        # Staying for nothing where V_i was once too large, or a loop of +1 and -1, can hold V up.
+        if (np.abs(V[~ends]) > 1e-9).any():
+            raise SystemExit("error: V is held up by a loop without end; try policy_iteration.py")
     if len(R) <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]
         for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V

@@ -144,9 +144,10 @@ def identity(args: dict) -> tuple:
 
 
 def run_directories(folder: Path, pattern: str = "*") -> list[Path]:
-    """The run directories below a folder, oldest first: their names end in the time."""
+    """The run directories below a folder, oldest first: their names end in the time, but for
+    published ones, which come before all others."""
     found = [path.parent for path in folder.rglob(f"{pattern}/args.json")]
-    return sorted(found, key=lambda run_dir: (run_dir.name.rpartition("__")[2], run_dir))
+    return sorted(found, key=lambda run_dir: (run_dir.name.rpartition("__")[1:], run_dir))
 
 
 # ---- study -------------------------------------------------------------------------------------

@@ -500,6 +500,7 @@ def test_evaluation_acts_at_random_in_1_of_20_frames_and_is_reproducible(evaluat
 def test_mean_and_variance_by_hand():
     counters = dqn.Counters(frames=3, updates=2, episodes=1, seconds=1.25)
     row = dqn.summary(counters, [(1.0, 10), (4.0, 20), (7.0, 60)])
-    assert row == {"frames": 3, "updates": 2, "episodes": 1, "score_mean": 4, "score_variance": 6,
-                   "length_mean": 30, "length_variance": pytest.approx(1400 / 3), "seconds": 1.2}
+    assert row == {"frames": 3, "updates": 2, "episodes": 1, "score_mean": 4, "score_variance": 9,
+                   "length_mean": 30, "length_variance": pytest.approx(700), "seconds": 1.2}
+    assert dqn.summary(counters, [(1.0, 10)])["score_variance"] == 0
     assert math.isnan(dqn.summary(counters, [])["score_mean"])
