@@ -112,7 +112,7 @@ def test_published_pong_wins_and_games_have_mean_and_variance(capsys, monkeypatc
     assert min(scores) >= 15 and sorted(PONG.rglob("*")) == before
     out = capsys.readouterr().out
     for a, b in (scores, [len(rows) for rows, _, _ in played]):
-        assert f"{(a + b) / 2:.5g}" in out and f"{(a - b) ** 2 / 4:.5g}" in out
+        assert f"{(a + b) / 2:.5g}" in out and f"{(a - b) ** 2 / 2:.5g}" in out
 
 
 def test_the_newest_run_is_found_else_the_published_one(tmp_path, monkeypatch):
