@@ -56,6 +56,7 @@ from tqdm import tqdm
 
 FRAMES_PER_SECOND = 15  # 60 emulator frames, each action repeated 4 times
 VIDEO_SIZE = 720, 420  # the screen, 320 wide, and beside it what the agent thinks
+BARS = 440, 640  # in it, from left to right: Q of an action
 GIF_FRAMES = 180  # the beginning of the video, 12 seconds
 COLOURS = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b"  # of the actions
 PUBLISHED = Path(__file__).resolve().parent.parent / "runs" / "published"
@@ -233,9 +234,9 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         trained = types.SimpleNamespace(**content["args"], actions=content["actions"])
         no_ops, repeat = trained.environment_no_op_max, trained.agent_action_repeat
-        # Gymnasium would import what stands before a colon.
+        # A hostile file: Gymnasium would import what stands before a colon, or play for ever.
         if ":" in trained.env_id or max(no_ops, repeat) > 10_000:
-            raise ValueError("its game is a module's, or is over before it can be played")
+            raise ValueError("its game has a module's name, or too many no-operations or repeats")
         shape = trained.environment_state_height, trained.environment_state_width
         with torch.device("meta"):  # shapes without memory, until they are seen to be the file's
             q_network = QNetwork(trained.agent_history_length, *shape, len(trained.actions))
@@ -309,7 +310,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # frames after a life
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")
@@ -361,7 +362,7 @@ def pictures(rows: list, q: np.ndarray, screens: list, trained) -> Iterator[Imag
     large, small = ImageFont.load_default(24), ImageFont.load_default(16)
     value = q.max(axis=1)  # (T,)
     bar_scale, curve_scale = (min(q.min(), 0), max(q.max(), 0)), (value.min(), value.max())
-    zero, top = np.interp(0, bar_scale, (440, 640)), 122 + 28 * len(trained.actions)
+    zero, top = np.interp(0, bar_scale, BARS), 122 + 28 * len(trained.actions)
     for t, row in enumerate(tqdm(rows, "video", delay=2, leave=False)):
         image = Image.new("RGB", VIDEO_SIZE, "#16181f")
         image.paste(picture(screens[t]).resize((320, 420), Image.Resampling.NEAREST))
@@ -370,18 +371,18 @@ def pictures(rows: list, q: np.ndarray, screens: list, trained) -> Iterator[Imag
         for a, name in enumerate(trained.actions):
             y = 76 + 28 * a
             ink = "white" if a == q[t].argmax() else "darkgray"
-            draw.line((zero, y, np.interp(q[t, a], bar_scale, (440, 640)), y), COLOURS[a], 15)
+            draw.line((zero, y, np.interp(q[t, a], bar_scale, BARS), y), COLOURS[a], 15)
             draw.text((364, y), name, ink, small, anchor="lm")
             draw.text((704, y), f"{q[t, a]:.3f}", ink, small, anchor="rm")
             if a == q[t].argmax():
-                draw.rectangle((434, y - 12, 646, y + 12), outline="white")
+                draw.rectangle((BARS[0] - 6, y - 12, BARS[1] + 6, y + 12), outline="white")
             if name == row["action"]:
                 draw.circle((347, y), 6, "white" if row["choice"] == "greedy" else "tomato")
         draw.line((zero, 62, zero, top - 60), "darkgray")
         draw.text((340, top - 44), f"frame {t}     value {value[t]:.3f}", "white", small)
-        first = max(0, t - 179)
+        first = max(0, t + 1 - GIF_FRAMES)
         heights = np.interp(value[first : t + 1], curve_scale, (404, top))
-        curve = [(340 + 2 * i, y) for i, y in enumerate(heights)]
+        curve = [(340 + 2 * i, y) for i, y in enumerate(heights)]  # 2 pixels a frame
         draw.line(curve, "white", 2)
         for point, past in zip(curve, rows[first : t + 1], strict=True):
             if past["reward"]:
@@ -408,6 +409,7 @@ def write_video(folder: Path, images: Iterator[Image.Image]) -> None:
     video.release()
     palette = Image.fromarray(np.vstack([beginning[0], beginning[-1]])).quantize(64)
     gif = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in beginning]
+    # A GIF counts in hundredths of a second.
     gif[0].save(folder / "play.gif", save_all=True, append_images=gif[1:], loop=0, duration=70)
 
 

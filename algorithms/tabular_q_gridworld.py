@@ -147,7 +147,7 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break
+                break  # else the last outcome: the probabilities add up to 1
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 
@@ -277,6 +277,7 @@ def draw_action_values(axes: Axes, world: GridWorld, Q: np.ndarray, title: str) 
     for (x, y), values, best in zip(world.cells, Q, greedy(Q), strict=True):
         axes.text(x, y, arrows(best), fontsize=20 / best.sum(), weight="bold", **centred)
         for value, (dx, dy) in zip(values, world.moves.values(), strict=True):
+            # a triangle: the middle of the cell, and the two corners on the action's side
             corners_x = [x, x + (dx - dy) / 2, x + (dx + dy) / 2]
             corners_y = [y, y + (dy + dx) / 2, y + (dy - dx) / 2]
             colour = colormaps["RdBu"](0.5 + value / scale)  # red < 0 < blue
@@ -284,7 +285,7 @@ def draw_action_values(axes: Axes, world: GridWorld, Q: np.ndarray, title: str) 
             axes.text(x + 0.32 * dx, y + 0.38 * dy, f"{value:.3f}", fontsize=8.5, **centred)
     for (x, y), reward in world.terminals.items():  # they cover the triangles of their cells
         colour = colormaps["RdBu"](0.5 + reward / scale)
-        axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6, zorder=4)
+        axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6, zorder=4)  # square
         axes.text(x, y, f"{reward:+g}", fontsize=24, weight="bold", zorder=5, **centred)
     axes.set(xticks=[1, 2, 3, 4], yticks=[1, 2, 3], aspect="equal", facecolor="0.8", title=title)
 
@@ -320,6 +321,8 @@ def main() -> None:
 
     Q, visited = np.array(Q), np.any(N, axis=1)  # (S, A) and (S,)
     names, actions = range(len(Q)), range(len(Q[0]))
+    if isinstance(world, GridWorld):
+        names, actions = world.cells, world.actions
     tables = {f"Q after {episode:,} episodes": Q}
     if model is not None:
         tables["Q* by value iteration"] = Q_star
@@ -327,7 +330,6 @@ def main() -> None:
     *panels, last = figure.subplots(1, len(tables) + 1)
     for axes, (title, table) in zip(panels, tables.items(), strict=True):
         if isinstance(world, GridWorld):
-            names, actions = world.cells, world.actions
             print(f"{title}, and its policy:\n{action_values_text(world, table)}\n")
             draw_action_values(axes, world, table, title)
         else:
@@ -339,9 +341,11 @@ def main() -> None:
     figure.savefig(run_dir / "figure.png", dpi=100)
 
     if model is not None:
+        # Every action that is best in Q is best in Q*.
         optimal = (greedy(Q) <= greedy(Q_star)).all(axis=1)[visited].sum()
         print(f"{label} = {score:.4f}, optimal in {optimal} of {visited.sum()} states visited")
-    print(f"{np.sum(N):,} steps, last 100 episodes' mean return {np.mean(returns[-100:]):.4g}")
+    score = np.mean(returns[-100:])
+    print(f"{np.sum(N):,} steps; mean return of the last 100 episodes {score:.4g}, while exploring")
     result = {"action_values": {}, "policy": {}}
     for s in np.flatnonzero(visited):
         result["action_values"][str(names[s])] = dict(zip(map(str, actions), Q[s], strict=True))

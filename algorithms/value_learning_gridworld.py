@@ -139,7 +139,7 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break
+                break  # else the last outcome: the probabilities add up to 1
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 
@@ -197,9 +197,9 @@ def exact_values(world: GridWorld, policy: dict[int, int], discount: float) -> n
         for probability, s_next, r, terminated in world.P[s][a]:
             R[s] += probability * r
             P[s, s_next] += 0 if terminated else probability
-    ends = P.sum(axis=1) < 1 - 1e-9  # (S,) bool: the episode may end here, and then, step by step,
+    ends = P.sum(axis=1) < 1 - 1e-9  # (S,) bool: the episode may end with the next step
     for _ in world.cells:
-        ends |= P @ ends > 1e-9  # where it may end later
+        ends |= P @ ends > 1e-9  # or with a later one, at most as many as there are cells
     if discount == 1 and not ends.all():
         raise SystemExit("error: from some cell the policy never ends: no finite V at discount 1")
     # V^π(s) = Σ_s' P(s'|s,π(s)) [R(s,π(s),s') + γ V^π(s')], that is (I - γP) V = R    Equations 2-3
@@ -228,12 +228,12 @@ def draw_values(axes: Axes, world: GridWorld, V: np.ndarray, policy: dict, title
     """V (S,) as colours and numbers, and the policy {s: a} as arrows."""
     scale = 3.2 * max(1, np.abs(V).max())  # 3.2: colours stay pale enough for black text
     for s, (x, y) in enumerate(world.cells):
-        value, text = world.terminals.get((x, y)), ""
+        value, text = world.terminals.get((x, y)), ""  # of an end
         if s in policy:
             value, text = V[s], "←↑→↓"[policy[s]]
             axes.text(x, y - 0.3, f"{value:.3f}", fontsize=11, ha="center")
         colour = colormaps["RdBu"](0.5 + value / scale)  # red < 0 < blue
-        axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6)
+        axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6)  # a square
         axes.text(x, y, text or f"{value:+g}", fontsize=24, weight="bold", ha="center", va="center")
     axes.set(xticks=[1, 2, 3, 4], yticks=[1, 2, 3], aspect="equal", facecolor="0.8", title=title)
     axes.set(xlim=(0.3, 4.7), ylim=(0.3, 3.7))

@@ -104,12 +104,14 @@ def test_largest_jumps_against_every_choice(seed):
     assert play.largest_jumps(values) == list(best)
 
 
-def test_published_pong_wins_and_games_have_mean_and_variance(capsys, monkeypatch):
-    played, whole, before = [], play.play, sorted(PONG.rglob("*"))
+@pytest.mark.parametrize(("game", "modest"), [("pong", 15), ("breakout", 10)])
+def test_published_agents_play_and_games_have_mean_and_variance(game, modest, capsys, monkeypatch):
+    folder = PONG.parent / game
+    played, whole, before = [], play.play, sorted(folder.rglob("*"))
     monkeypatch.setattr(play, "play", lambda *a: played.append(whole(*a)) or played[-1])
-    play.main(play.Args(game="pong", games=2))
+    play.main(play.Args(game=game, games=2))
     scores = [sum(row["reward"] for row in rows) for rows, _, _ in played]
-    assert min(scores) >= 15 and sorted(PONG.rglob("*")) == before
+    assert min(scores) >= modest and sorted(folder.rglob("*")) == before
     out = capsys.readouterr().out
     for a, b in (scores, [len(rows) for rows, _, _ in played]):
         assert f"{(a + b) / 2:.5g}" in out and f"{(a - b) ** 2 / 2:.5g}" in out
