@@ -707,6 +707,7 @@ def main(args: Args) -> None:
     # Points after the checkpoint are purged: they are drawn once more.
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
+    print(f"Learning starts, and slows it down, at frame {args.agent_replay_buffer_initial:,}.")
 
     def save_q_network() -> None:
         """What it takes to play."""
