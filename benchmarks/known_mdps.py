@@ -5,7 +5,8 @@
     python benchmarks/known_mdps.py --sizes 1000
 
 Random MDPs from arrays: 4 actions in every state, 5 successors, discount 0.95; both get the same.
-A solve has a process of its own: its peak memory counts libraries and model. Ratio: ours / theirs.
+A solve has a process of its own: its peak memory counts libraries and model. Of two solves in turns
+the quicker counts. Ratio: ours / theirs.
 """
 
 import importlib
@@ -131,6 +132,16 @@ def apart(limit: float | None, function, *arguments):
             return None
 
 
+def in_turns(limit: float, what: str, size: int) -> list:
+    """The quicker of two solves of ours and of QuantEcon's, in turns; None: given up."""
+    solves, found = (our_solve, their_solve), ([], [])
+    for _ in range(2):
+        for solve, solved in zip(solves, found, strict=True):
+            if None not in solved:
+                solved.append(apart(limit, solve, what, size))
+    return [None if None in solved else min(solved, key=lambda one: one[0][0]) for solved in found]
+
+
 def cpu() -> str:
     """The processor's model, on Linux."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -147,7 +158,7 @@ def main(args: Args) -> None:
         times = f"{1e3 * ours:.3g} ms; QuantEcon {1e3 * theirs:.3g} ms"
         print(f"  bellman_sweep: {times}; ratio {ours / theirs:.2g}", flush=True)
         for what in ("value_iteration", "policy_iteration", "policy_evaluation"):
-            found = [apart(args.limit, solve, what, size) for solve in (our_solve, their_solve)]
+            found = in_turns(args.limit, what, size)
             for who, one in zip(("", "QuantEcon "), found, strict=True):
                 text = f"given up after {args.limit:g} s"
                 if one:
