@@ -657,8 +657,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             last = info["final_obs"][i] if ended[i] else x[i]
             s_next = (*s[i][1:], lz4.block.compress(last))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
-            first = (lz4.block.compress(x[i]),) * args.agent_history_length
-            s[i] = first if ended[i] else s_next
+            s[i] = (lz4.block.compress(x[i]),) * len(s_next) if ended[i] else s_next
 
         # The processes agree on the number of episodes, and whether one of them is to stop.
         sums = torch.tensor([ended.sum(), len(stop)])

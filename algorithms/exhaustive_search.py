@@ -199,8 +199,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
             model = env.P
         # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
-        if not model:
-            raise ValueError("no state has an action")
+        _, *_ = model  # at least one state
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
     return model, env
@@ -213,22 +212,20 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
     """
     column = {s: i for i, s in enumerate(model)}
     rows = [(s, a, t) for s in model for a, t in model[s].items()]
-    entries, R = [], []
+    P, R = sparse.lil_array((len(rows), len(model))), np.zeros(len(rows))
     for row, (s, a, transitions) in enumerate(rows):
         try:
-            p, _, rewards, ends = zip(*transitions, strict=True)
-            valid = min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and {*ends} <= {True, False}
-            if not (valid and np.isfinite(sum(rewards))):
+            for p, s_next, reward, terminated in transitions:
+                R[row] += p * reward
+                if going_on := p * (1 - terminated):  # nothing comes after an end
+                    P[row, column[str(s_next)]] += going_on
+            p = [transition[0] for transition in transitions]
+            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[row])):
                 raise ValueError
-            entries += [(p, row, column[str(n)]) for p, n, _, end in transitions if p and not end]
-            R.append(np.dot(p, rewards))
         except Exception:  # wrong numbers, an unknown next state, or not four values
             raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    p, *places = np.array(entries).reshape(-1, 3).T  # (transitions,) each, which may be 0
-    # Two ways from a pair (s, a) to the same state are added up.
-    P = sparse.csr_array((p, np.array(places, int)), shape=(len(R), len(model)))
     # The first row of a state is the number of actions of the states before it.
-    return P, np.array(R, float), np.cumsum([0, *map(len, model.values())])[:-1]
+    return P.tocsr(), R, np.cumsum([0, *map(len, model.values())])[:-1]
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:

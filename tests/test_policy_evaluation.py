@@ -73,6 +73,7 @@ class TestEveryScript:
     @pytest.mark.parametrize("transitions", [
         [go("goal", 1, 0.9)], [go("goal", 1, 1.5), go("goal", 1, -0.5)], [go("nowhere")],
         [go("goal", float("nan"))], [go("goal", float("inf"))], [go("goal", 10**400)],
+        [[1, "s", 0, "false"]], [go("goal", [1])],
         [go("goal", 1, float("nan")), go("goal")], [go("goal", 1, "1")], [go("goal")[:3]], [], 7])
     def test_bad_models(self, script, transitions, tmp_path):  # fmt: skip
         model = {"s": {"a": [go("goal")]}, "here": {"this": transitions}}
