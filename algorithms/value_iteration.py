@@ -1,7 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "gymnasium>=1.0", "matplotlib>=3.9", "numpy>=2.0", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+#     "gymnasium>=1.0", "matplotlib>=3.9", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14",
+#     "tqdm>=4.66", "tyro>=0.9",
 # ]
 # ///
 """Value iteration: the best policy of a known Markov decision process (§4.3, Algorithm 3).
@@ -25,7 +26,6 @@ Deviations
     one has (FrozenLake's holes and goal), its V means nothing.
 """
 
-import functools
 import json
 import sys
 from dataclasses import dataclass
@@ -33,6 +33,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import tyro
 from matplotlib.figure import Figure
 from scipy import sparse
@@ -72,90 +73,75 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-ARROWS = {"FrozenLakeEnv": "←↓→↑", "CliffWalkingEnv": "↑→↓←"}  # of actions 0 to 3
+# The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
+WAYS = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
 
-# `arrays`, below, makes of it P (rows, S), sparse, R (rows,) and first_row (S,). Figure 5:
-#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')    first_row
-#     s0, a1         .    1    .    10                                0
-#     s0, a2         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
-#     s1, a1         .    .    .     1                                2
-#     s2, a1         .    .    .     1                                3
-#     s2, a2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
-# A row is a pair (s, a). A transition that terminates is left out of P, for nothing comes after it.
-# So a row's sum is the chance to go on, and sG has no row, no column, and V = 0.
+# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+#                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
+#     a1, s0         .    1    .    10
+#     a1, s1         .    .    .     1
+#     a1, s2         .    .    .     1
+#     a2, s0         .   .6   .4     8 = 0.6 · 10 + 0.4 · 5
+#     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
+#     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
+# A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
+# chance to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: value iteration ------------------------------------------------------------------
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
-    """Q (rows,) of the values V (S,)."""
+    """Q (A, S) of the values V (S,)."""
     # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
-    return R + discount * (P @ V)  # (rows,)
+    Q = (P @ (discount * V)).reshape(R.shape)  # (A, S)
+    return np.add(R, Q, out=Q)  # R + Q without a copy, which at 10^6 states is a third of the time
 
 
-def maximum(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
-    """max_a Q(s, a): (rows,) → (S,)."""
-    width, rest = divmod(len(Q), len(first_row))
-    if rest == 0 and (first_row == width * np.arange(len(first_row))).all():
-        # Every state has `width` actions: the same as below, action by action, is much quicker.
-        return functools.reduce(np.maximum, Q.reshape(-1, width).T)  # (S,)
-    return np.maximum.reduceat(Q, first_row)  # (S,) over rows first_row[s] to first_row[s + 1] - 1
-
-
-def value_iteration(P, R, first_row, discount: float, tolerance=1e-12, max_iterations=100_000):
+def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_000):
     """Algorithm 3: V* (S,), and the largest change of a V(s) in each sweep, relative to |V(s)| if
     that is above 1.
 
     Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
     """
-    V, changes = np.zeros(len(first_row)), []  # V: (S,)
+    V, changes = np.zeros(R.shape[1]), []  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
         # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
-        V, V_old = maximum(backup(P, R, V, discount), first_row), V  # (S,)
+        V, V_old = backup(P, R, V, discount).max(axis=0), V  # (S,)
         changes.append((np.abs(V - V_old) / np.maximum(1, np.abs(V))).max())
         if changes[-1] <= tolerance:
             return V, changes
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
-def argmax(Q: np.ndarray, first_row: np.ndarray) -> np.ndarray:
-    """argmax_a Q(s, a): (rows,) → (S,) int, the first best row of each state."""
-    counts = np.diff(first_row, append=len(Q))  # (S,) |A_s|
-    rows = np.flatnonzero(Q == np.repeat(maximum(Q, first_row), counts))  # the best of all states
-    return rows[np.searchsorted(rows, first_row)]
-
-
-def greedy_policy(P, R, first_row: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At discount 1: π (S,) int, a row for each state, and where it may end (S,) bool. Of the best
-    actions that tie, π takes one that soonest ends, or rests for nothing."""
-    V, counts = maximum(Q, first_row), np.diff(first_row, append=len(Q))  # (S,), (S,) |A_s|
-    tied = np.isclose(Q, np.repeat(V, counts), rtol=1e-9, atol=1e-9)  # (rows,)
+def greedy_policy(P, R, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At discount 1: π (S,) int and where it may end (S,) bool. Of the best actions that tie, π
+    takes one that soonest ends, or rests for nothing."""
+    V = Q.max(axis=0)  # (S,)
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
     # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
-    rests = (np.abs(R) <= 1e-9) & (P @ (np.abs(V) > 1e-9) == 0)  # (rows,) an end, too: V stays 0
-    ends = (1 - P.sum(axis=1)).round(8)  # (rows,) the chance to end
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) the chance to end
+    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S) an end, too: V stays 0
     V_end, V_old = np.zeros(len(V)), None  # (S,)
     while not np.array_equal(V_end, V_old):
-        Q_end = np.where(tied, 0.995 * np.where(rests, 1, ends + P @ V_end), -1)  # (rows,)
-        V_end, V_old = maximum(Q_end, first_row), V_end  # (S,)
-    return argmax(Q_end, first_row), V_end > 0
+        Q_end = np.where(tied, 0.995 * np.where(rests, 1, backup(P, ends, V_end, 1)), -1)  # (A, S)
+        V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
+    return Q_end.argmax(axis=0), V_end > 0
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
 
 
-def read_model(args: Args) -> tuple[dict, gym.Env | None]:
-    """The model that the flags name, else Figure 5, and its environment, if it has one.
+def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.ndarray]:
+    """The model that the flags name, else Figure 5; its environment, if it has one; P and R.
 
     Exits with one line if there is no model.
     """
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
-    model, env = FIGURE_5, None
     try:
-        if args.model:
-            model = json.loads(args.model.read_text("utf-8"))
+        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -163,33 +149,32 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None]:
             model = env.P
         # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
-        _, *_ = model  # at least one state
+        return model, env, *arrays(model)
     except Exception as error:  # no such file, environment or argument, or it has no model
         raise SystemExit(f"error: {args.env_id or args.model}: {error!r}") from None
-    return model, env
 
 
-def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
-    """P (rows, S), R (rows,) and first_row (S,) of a model.
+def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
+    """P (A·S, S) and R (A, S) of a model of S states, with at most A actions in each.
 
     Exits with one line if a state and action make no sense.
     """
-    column = {s: i for i, s in enumerate(model)}
-    rows = [(s, a, t) for s in model for a, t in model[s].items()]
-    P, R = sparse.lil_array((len(rows), len(model))), np.zeros(len(rows))
-    for row, (s, a, transitions) in enumerate(rows):
-        try:
-            for p, s_next, reward, terminated in transitions:
-                R[row] += p * reward
-                if going_on := p * (1 - terminated):  # nothing comes after an end
-                    P[row, column[str(s_next)]] += going_on
-            p = [transition[0] for transition in transitions]
-            if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[row])):
-                raise ValueError
-        except Exception:  # wrong numbers, an unknown next state, or not four values
-            raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
-    # The first row of a state is the number of actions of the states before it.
-    return P.tocsr(), R, np.cumsum([0, *map(len, model.values())])[:-1]
+    A, S = max(map(len, model.values())), len(model)
+    P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
+    index = {s: i for i, s in enumerate(model)}
+    for s, i in index.items():
+        for k, (a, transitions) in enumerate(model[s].items()):
+            try:
+                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, s_next, _, terminated in transitions:
+                    if going_on := p * (1 - terminated):  # nothing comes after an end
+                        P[k * S + i, index[str(s_next)]] += going_on
+                p = [transition[0] for transition in transitions]
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                    raise ValueError
+            except Exception:  # wrong numbers, an unknown next state, or not four values
+                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+    return P.tocsr(), R
 
 
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
@@ -200,37 +185,31 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
-    """Print the rows in columns that line up, with i = 0, 1, ... before them."""
-    lines = [["i", *header], *([str(i), *row] for i, row in enumerate(rows))]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in [*lines, []]:
-        print("  ".join(map(str.ljust, line, widths)).rstrip())
+    """Print the rows i = 0, 1, ... of a table of the lecture."""
+    print(pd.DataFrame(rows, columns=header).rename_axis(columns="i").to_string(), "\n")
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
-    """A row of the lecture's table of Q_i(s, a) (rows,), worked out from V_i (S,)."""
+    """A row of the lecture's table of Q_i(s, a) (A, S), worked out from V_i (S,)."""
     texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
-    rows = [transitions for actions in model.values() for transitions in actions.values()]
-    return [f"{worked(t, discount, texts)} = {round(q, 2):g}" for t, q in zip(rows, Q, strict=True)]
+    pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
+    return [f"{worked(t, discount, texts)} = {round(q, 2):g}" for t, q in pairs]
 
 
-def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
-    """Print V (S,) and π (S,), and write them with Q (rows,) to `path`. NaN is undefined. The
-    Bellman residual is the largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| of a policy."""
-    actions = [(s, a) for s, choices in model.items() for a in choices]  # of every row
-    V, Q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q))  # JSON has no NaN
-    q = iter(Q)  # goes through the rows
-    solution = {
-        "values": dict(zip(model, V, strict=True)),
-        "action_values": {s: {a: next(q) for a in choices} for s, choices in model.items()},
-        "policy": dict(actions[row] for row in policy[policy >= 0]),
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
+    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
+    solution = {  # in JSON, undefined is null
+        "values": dict(zip(model, values, strict=True)),
+        "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
+        "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,
-        "residual": float(residual),
+        "residual": float(np.nanmax(np.abs(Q[policy, np.arange(len(V))] - V))),
     }
-    for s, v in zip(list(model)[:20], V, strict=False):
-        text = "undefined" if v is None else round(v, 12)
-        print(f"V({s}) = {text:<16} π({s}) = {solution['policy'].get(s, '-')}")
-    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
+    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]}).head(20)
+    print(table.to_string(float_format="{:.12g}".format, na_rep="undefined"))
+    print(f"{iterations} iterations, Bellman residual {solution['residual']:.2g}")
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
@@ -241,15 +220,13 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest change of V")
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), marker=".")
-    if arrows := ARROWS.get(type(env).__name__):
+    if ways := WAYS.get(type(env).__name__):
         acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, goal or cliff
         cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # (rows, columns)
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
         figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
-        for s in np.flatnonzero(acts):
-            y, x = divmod(s, cells.shape[1])
-            # 4 actions a state, so row % 4 is the action
-            axes.text(x, y, arrows[policy[s] % 4], ha="center", va="center", fontsize=16)
+        arrows = np.where(acts, np.array(ways)[policy], np.nan).reshape(cells.shape)
+        axes.quiver(arrows.real, arrows.imag, pivot="mid")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png", dpi=120)
 
@@ -259,28 +236,25 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
 
 def main(args: Args) -> None:
     """Solve the MDP that the flags name, and report."""
-    model, env = read_model(args)
-    P, R, first_row = arrays(model)
-    limits = args.discount, args.tolerance, args.max_iterations
-    V, changes = value_iteration(P, R, first_row, *limits)
-    Q = backup(P, R, V, args.discount)  # (rows,)
+    model, env, P, R = read_model(args)
+    V, changes = value_iteration(P, R, args.discount, args.tolerance, args.max_iterations)
+    Q = backup(P, R, V, args.discount)  # (A, S)
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    policy = argmax(Q, first_row)  # (S,) int, rows
+    policy = Q.argmax(axis=0)  # (S,)
     if args.discount == 1:
-        policy, ends = greedy_policy(P, R, first_row, Q)
+        policy, ends = greedy_policy(P, R, Q)
         # Staying for nothing where V_i was once too large, or a loop of +1 and -1, can hold V up.
         if (np.abs(V[~ends]) > 1e-9).any():
             raise SystemExit("error: V is held up by a loop without end; try policy_iteration.py")
-    if len(R) <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
-        values, Q_rows = [np.zeros(len(V))], [["0"] * len(R)]
+    if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
+        values, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
         for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V
-            Q_i = backup(P, R, values[-1], args.discount)  # (rows,)
+            Q_i = backup(P, R, values[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
-            values.append(maximum(Q_i, first_row))  # (S,)
+            values.append(Q_i.max(axis=0))  # (S,)
         print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
-    residual = np.abs(maximum(Q, first_row) - V).max()
-    report(args.output_json, model, V, Q, policy, len(changes), residual)
+    report(args.output_json, model, V, Q, policy, len(changes))
     if args.figure:
         save_figure(args.figure, env, P, V, policy, changes)
 

@@ -42,24 +42,25 @@ class Args:
     """seconds after which a solve is given up, imports and the making of the model included"""
 
 
-def our_mdp(size: int) -> tuple[sparse.csr_array, np.ndarray, np.ndarray]:
-    """P (rows, S), R (rows,) and first_row (S,), the same every time."""
+def our_mdp(size: int) -> tuple[sparse.csr_array, np.ndarray]:
+    """P (A·S, S) and R (A, S), the same every time."""
     rng, rows = np.random.default_rng(0), size * ACTIONS
     p = rng.random((rows, SUCCESSORS))
     p /= p.sum(axis=1, keepdims=True)
     s_next = rng.integers(0, size, rows * SUCCESSORS, dtype=np.int32)
     ends = np.arange(rows + 1, dtype=np.int32) * SUCCESSORS
     P = sparse.csr_array((p.ravel(), s_next, ends), shape=(rows, size))
-    return P, rng.random(rows), np.arange(size) * ACTIONS
+    return P, rng.random((ACTIONS, size))
 
 
 def their_mdp(size: int):
     """The same as a DiscreteDP of state-action pairs, compiled."""
     from quantecon.markov import DiscreteDP  # here, for the peak memory of ours is without it
 
-    P, R, _ = our_mdp(size)
+    P, R = our_mdp(size)
     pairs = np.repeat(np.arange(size), ACTIONS), np.tile(np.arange(ACTIONS), size)
-    ddp = DiscreteDP(R, sparse.csr_matrix(P), DISCOUNT, *pairs)
+    by_state = pairs[1] * size + pairs[0]  # its order: the actions of a state stand together
+    ddp = DiscreteDP(R.ravel()[by_state], sparse.csr_matrix(P[by_state]), DISCOUNT, *pairs)
     ddp.solve("value_iteration", max_iter=1)
     return ddp
 
@@ -67,9 +68,9 @@ def their_mdp(size: int):
 def bellman_sweeps(size: int, number: int) -> list[float]:
     """Median seconds of a sweep, ours and theirs, in turns of ten in one process."""
     script = importlib.import_module("value_iteration")
-    (P, R, first_row), ddp = our_mdp(size), their_mdp(size)
+    (P, R), ddp = our_mdp(size), their_mdp(size)
     V, V_next = np.random.default_rng(1).random(size), np.empty(size)
-    sweeps = (lambda: script.maximum(script.backup(P, R, V, DISCOUNT), first_row),
+    sweeps = (lambda: script.backup(P, R, V, DISCOUNT).max(axis=0),
               lambda: ddp.bellman_operator(V, Tv=V_next))  # fmt: skip
     seconds = [], []
     for turn in range(0, number, 10):
@@ -85,21 +86,20 @@ def bellman_sweeps(size: int, number: int) -> list[float]:
 
 def our_solve(what: str, size: int) -> tuple[float, int, np.ndarray]:
     """Seconds, iterations and V."""
-    script, (P, R, first_row) = importlib.import_module(what), our_mdp(size)
+    script, (P, R) = importlib.import_module(what), our_mdp(size)
     began, iterations = time.perf_counter(), 1
     if what == "value_iteration":
         # QuantEcon's rule for a change of V; ours is relative to |V|, which is at most 1 / (1 - γ)
         tolerance = EPSILON * (1 - DISCOUNT) ** 2 / (2 * DISCOUNT)
-        V, changes = script.value_iteration(P, R, first_row, DISCOUNT, tolerance)
+        V, changes = script.value_iteration(P, R, DISCOUNT, tolerance)
         iterations = len(changes)
-        script.greedy_policy(P, R, first_row, script.backup(P, R, V, DISCOUNT))
+        script.backup(P, R, V, DISCOUNT).argmax(axis=0)
     elif what == "policy_iteration":  # from the greedy policy of max_a R(s, a), as QuantEcon does
-        Q = script.backup(P, R, script.maximum(R, first_row), DISCOUNT)
-        policy, _ = script.greedy_policy(P, R, first_row, Q)
-        steps = script.policy_iteration(P, R, first_row, policy, DISCOUNT)
+        policy = script.backup(P, R, R.max(axis=0), DISCOUNT).argmax(axis=0)
+        steps = script.policy_iteration(P, R, policy, DISCOUNT)
         V, iterations = steps[-1][1], len(steps)
     else:  # the first action everywhere
-        V = script.solve_system(P[first_row], R[first_row], DISCOUNT)
+        V = script.solve_system(P[:size], R[0], DISCOUNT)
     return time.perf_counter() - began, iterations, V
 
 

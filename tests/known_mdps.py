@@ -39,7 +39,7 @@ def refused(script, folder, model=None, **settings):
 
 def tables(text):
     """The printed tables: rows of cells, without the header and the column of i."""
-    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("i  ")]
+    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("i ")]
     return [[[cell.strip() for cell in line.split("  ") if cell][1:] for line in block[1:]]
             for block in blocks]  # fmt: skip
 
