@@ -558,7 +558,7 @@ class Counters:
     speeds: list[float] = dataclasses.field(default_factory=list)  # frames/s, by REPORT_INTERVAL
 
 
-def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
+def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
     columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}

@@ -7,8 +7,8 @@
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the lock
-on a run, the choice of the precision, RMSProp and the count of dead units. To
---optimizer-learning-rate the flags are Table 3's, from --env-id on this script's own.
+on a run, checksums, the choice of the precision, RMSProp, the count of dead units and the speeds in
+test.json. To --optimizer-learning-rate the flags are Table 3's, from --env-id on this script's own.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
     network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
@@ -53,7 +53,7 @@ import os
 import signal
 import sys
 import time
-import zipfile
+import types
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal
@@ -480,19 +480,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
 # ---- report and checkpoint -----------------------------------------------------------------------
 
 
-@dataclasses.dataclass
-class Counters:
-    """Everything that the loop counts."""
-
-    frames: int = 0
-    updates: int = 0
-    episodes: int = 0
-    seconds: float = 0.0  # wall-clock, without the pauses between stop and resume
-    evaluations: list[dict] = dataclasses.field(default_factory=list)  # rows of evaluations.csv
-    speeds: list[float] = dataclasses.field(default_factory=list)  # frames/s, by REPORT_INTERVAL
-
-
-def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
+def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
     columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
@@ -501,23 +489,6 @@ def summary(counters: Counters, finished: list[tuple[float, int]]) -> dict:
         row[f"{name}_mean"] = float(np.mean(values))
         row[f"{name}_variance"] = float(np.var(values, ddof=min(1, len(values) - 1)))
     return row | {"seconds": round(counters.seconds, 1)}
-
-
-def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple) -> None:
-    """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
-    and how fast the first and the last tenth of the learning frames were."""
-    evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
-    tenth = math.ceil(len(counters.speeds) / 10)
-    result = summary(counters, finished) | {
-        "last_evaluations_score_mean": float(np.mean(evaluations)),
-        "unfinished_score_and_length": unfinished,
-        "frames_per_second_first_tenth": float(np.median(counters.speeds[:tenth] or [math.nan])),
-        "frames_per_second_last_tenth": float(np.median(counters.speeds[-tenth:] or [math.nan])),
-        "scores": [score for score, _ in finished],
-        "lengths": [length for _, length in finished],
-    }
-    print("\n".join(f"{name:32}{value}" for name, value in result.items()))
-    write_text(path, json.dumps(result, indent=2))
 
 
 def as_csv(rows: list[dict]) -> str:
@@ -565,31 +536,27 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     q_network = QNetwork(args.agent_history_length, *shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
-    learning_rate = args.optimizer_learning_rate
-    optimizer = torch.optim.Adam(q_network.parameters(), lr=learning_rate, fused=True)
+    optimizer = torch.optim.Adam(q_network.parameters(), args.optimizer_learning_rate, fused=True)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
     # 5-7  ε is a function of the frame; the rest is counted.
-    counters = Counters()
+    counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[])
     exploration_rng, minibatch_rng = rngs
 
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
     if args.resume:
         path = Path(args.resume) / "checkpoint.pt"
         try:
-            if zipfile.ZipFile(path).testzip():
-                raise ValueError("a checksum is wrong")
             saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in it
             for name, part in parts.items():
                 part.load_state_dict(saved[name])
-            counters = Counters(**saved["counters"])
+            vars(counters).update(saved["counters"])
         except Exception as error:  # a damaged file can raise anything
             raise SystemExit(f"error: {path} cannot be resumed from: {error!r:.200}") from None
     # The same θ, under a wrapper that averages the gradients of all processes in backward().
     shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
     if rank == 0:
-        now = time.strftime("%Y%m%d-%H%M%S")
-        name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{now}"
+        name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
         run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
@@ -613,12 +580,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     stop = []  # signals: the loop ends with the step, or the evaluation, that it is at
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
-    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1,
-               disable=rank > 0)
+    bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, disable=rank > 0)
     loss = q = torch.zeros(())  # until the first update
     started = time.monotonic() - counters.seconds
-    save_time = window_time = time.monotonic()
-    window_frames, stops, due = counters.frames, 0, 0
+    save_time, stops, due = time.monotonic(), 0, 0
     step = args.num_simulators * ranks  # frames: one of each simulator of each process
 
     # 8, 30  while total_frames < number of frames to train
@@ -633,8 +598,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
 
         # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while an update is due for the
         # frames so far. Before lines 13-17, unlike in Algorithm 6: the simulators step meanwhile.
-        learning = replay.added * ranks >= args.agent_replay_buffer_initial
-        due += step if learning else 0  # frames
+        due += step if replay.added * ranks >= args.agent_replay_buffer_initial else 0  # frames
         while due >= args.agent_update_frequency:
             due -= args.agent_update_frequency
             batch_size = args.optimizer_minibatch_size // ranks
@@ -644,8 +608,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             counters.updates += 1
 
         # 24-26  θ⁻ = θ
-        interval = args.optimizer_q_network_parameter_update_interval_frames
-        if passed(counters.frames, step, interval):
+        if passed(counters.frames, step, args.optimizer_q_network_parameter_update_interval_frames):
             target_network.load_state_dict(q_network.state_dict())
 
         # 13-17  Add (s, a, r, s') to 𝒟. A simulator whose episode has ended has reset itself.
@@ -687,14 +650,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         bar.update(step)
         counters.seconds = time.monotonic() - started
         if passed(counters.frames, step, REPORT_INTERVAL):
-            speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
-            scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
-                       "losses/td_loss": loss.item(), "losses/q_values": q.mean().item()}
-            for name, value in scalars.items():
-                writer.add_scalar(name, value, counters.frames)
-            if learning:
-                counters.speeds.append(speed)
-            window_time, window_frames = time.monotonic(), counters.frames
+            writer.add_scalar("charts/SPS", bar.format_dict["rate"] or 0, counters.frames)
+            writer.add_scalar("charts/epsilon", epsilon, counters.frames)
+            writer.add_scalar("losses/td_loss", loss, counters.frames)
+            writer.add_scalar("losses/q_values", q.mean(), counters.frames)
         late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes
         interval = args.environment_checkpoint_interval_episodes
         if late or passed(counters.episodes, episodes, interval):
@@ -715,8 +674,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     if rank == 0:
-        finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
-        write_test(run_dir / "test.json", counters, finished, unfinished)
+        finished, _ = evaluate(args, q_network, replay.decode, number=0)
+        test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
+        print("\n".join(f"{name:32}{value}" for name, value in test.items()))
+        write_text(run_dir / "test.json", json.dumps(test, indent=2))
 
 
 def main(args: Args) -> None:

@@ -15,8 +15,8 @@ Measured
 
 Deviations
     A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2.
-    Every evaluation starts from the values of the policies before it, as §4.2 suggests; the sweeps
-    that this saves are counted against starts from V = 0.
+    Every evaluation starts from the values of the policies before it, as §4.2 suggests. Each policy
+    is also evaluated from V = 0, to show how many sweeps that saves.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
     has no value (it may never end, at discount 1) is an error.
 """
@@ -40,7 +40,7 @@ from tqdm import tqdm, trange
 
 @dataclass
 class Args:
-    """V and rewards have the same unit; an iteration is a sweep over a policy's states."""
+    """An iteration is a sweep over a policy's states. V is a sum of rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -53,8 +53,8 @@ class Args:
     max_policies: int = 10_000
     """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
-    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
+    error of V may be γ / (1 - γ) times as large"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -69,7 +69,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
+# belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -89,7 +90,7 @@ def policies(P: sparse.csr_array, R: np.ndarray, start: np.ndarray) -> Iterator[
     stack = [np.full(len(start), -1)]
     while stack:
         policy = stack.pop()
-        # Actions are chosen in states that it reaches alone: all that they lead to is reached.
+        # Actions are chosen only in states that it reaches: s0 at first, s2 only after a2 in s0.
         decided = np.flatnonzero(policy >= 0)
         reached = (start > 0) | (P[policy[decided] * len(policy) + decided].sum(axis=0) > 0)  # (S,)
         undecided = np.flatnonzero(reached & (policy < 0))
@@ -106,14 +107,13 @@ def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndar
     """Of π (S,): V^π (S,), which is NaN where π never comes, the number of sweeps that it took from
     `warm` (S,), and how many it takes from V = 0."""
     states = np.flatnonzero(policy >= 0)  # (n,)
-    rows = policy[states] * len(policy) + states  # (n,)
+    rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
     P_π, R_π = P[rows][:, states], R[policy[states], states]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
     V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
     states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
-    limits = args.discount, args.tolerance, args.max_iterations
-    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, warm[states], *limits)
-    _, sweeps_from_0 = iterative_policy_evaluation(P_π, R_π, 0 * R_π, *limits)
+    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, warm[states], args)
+    _, sweeps_from_0 = iterative_policy_evaluation(P_π, R_π, np.zeros(len(states)), args)
     return V, sweeps, sweeps_from_0
 
 
@@ -137,17 +137,17 @@ def exhaustive_search(P, R, start: np.ndarray, args: Args) -> tuple:
     return *best, tried
 
 
-def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
+def iterative_policy_evaluation(P, R, V, args: Args) -> tuple[np.ndarray, int]:
     """Algorithm 1 from V (n,): V^π (n,), and the number of sweeps.
 
-    P (n, n) and R (n,) are the policy's own. Exits if V has not converged after max_iterations.
+    P (n, n) and R (n,) are the policy's own. Exits if V has not converged after --max-iterations.
     """
-    for sweep in trange(1, max_iterations + 1, desc="sweeps", delay=2, leave=False):
+    for sweep in trange(1, args.max_iterations + 1, desc="sweeps", delay=2, leave=False):
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
-        V, V_old = R + discount * (P @ V), V  # (n,)
-        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
+        V, V_old = R + args.discount * (P @ V), V  # (n,)
+        if (np.abs(V - V_old) <= args.tolerance * np.maximum(1, np.abs(V))).all():
             return V, sweep
-    raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
+    raise SystemExit(f"error: V has not converged in {args.max_iterations} sweeps")
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
@@ -159,10 +159,10 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
     """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    reached, before = goal, None
-    while not np.array_equal(reached, before):
-        reached, before = reached | (P @ reached > 0), reached
-    return reached
+    may, before = goal, None  # in 0 steps
+    while not np.array_equal(may, before):
+        may, before = may | (P @ may > 0), may  # in one step more
+    return may
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -172,8 +172,9 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     """
     if discount < 1:
         return np.ones(len(R), bool)
-    # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
-    live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
+    # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
+    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
     # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
@@ -192,7 +193,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
+        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -212,25 +213,25 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     """
     A, S = max(map(len, model.values())), len(model)
     P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
-    index = {s: i for i, s in enumerate(model)}
-    for s, i in index.items():
-        for k, (a, transitions) in enumerate(model[s].items()):
+    number = {state: s for s, state in enumerate(model)}
+    for state, s in number.items():
+        for a, (action, transitions) in enumerate(model[state].items()):
             try:
-                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
-                for p, s_next, _, terminated in transitions:
+                R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, next_state, _, terminated in transitions:
                     if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[k * S + i, index[str(s_next)]] += going_on
+                        P[a * S + s, number[str(next_state)]] += going_on
                 p = [transition[0] for transition in transitions]
-                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
             except Exception:  # wrong numbers, an unknown next state, or not four values
-                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+                raise SystemExit(f"error: {action} in {state}: invalid {transitions}") from None
     return P.tocsr(), R
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
-    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
-    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
+    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -257,8 +258,8 @@ def main(args: Args) -> None:
     policy, V, tried = exhaustive_search(P, R, start, args)
     for i, (value, sweeps, sweeps_from_0) in enumerate(tried[:10], start=1):
         print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")
-    _, warm, cold = np.sum(tried, axis=0)
-    print(f"{len(tried)} policies, {warm:.0f} sweeps, {cold:.0f} from V = 0\n")
+    _, sweeps, sweeps_from_0 = np.sum(tried, axis=0)
+    print(f"{len(tried)} policies, {sweeps:.0f} sweeps, {sweeps_from_0:.0f} from V = 0\n")
     report(args.output_json, model, V, backup(P, R, V, args.discount), policy, len(tried))
 
 

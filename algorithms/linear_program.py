@@ -36,8 +36,8 @@ from scipy import optimize, sparse
 
 @dataclass
 class Args:
-    """V, Q and rewards have the same unit; an iteration is one of the solver,
-    which may find the solution before its first one."""
+    """An iteration is one of the solver; a small program may need none. V and Q are sums of
+    rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -59,7 +59,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
+# belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -77,23 +78,25 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
     """Equation 27 as a linear program: V* (S,), and the solver's iterations.
 
-    V* is the smallest V that satisfies all inequalities: in each state one of them is an equation.
-    Exits if there is none.
+    V(s) is at least the right-hand side of Equation 27 for every action, so at least its maximum.
+    The smallest such V is V*: in each state the inequality of one action is an equation. Exits if
+    there is none.
     """
     # min Σ_s V(s)  subject to  V(s) ≥ R(s, a) + γ Σ_s' P(s'|s, a) V(s')  for all s and a,
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
     exists = np.isfinite(R.ravel())  # (A·S,)
     E = sparse.vstack([sparse.eye_array(R.shape[1])] * len(R))  # (A·S, S)
     A, b = (discount * P - E).tocsr()[exists], -R.ravel()[exists]
-    # float64 has 16 digits: beside a reward of 1e9, 1e-10 cannot be asked for.
+    # The solver's own 1e-7 cannot tell close actions apart; beside a reward of 1e9, 1e-10 cannot be
+    # asked for: a float64 has 16 digits.
     digits = float(np.clip(1e-16 * np.abs(b).max(), 1e-10, 1e-7))
     tolerances = {"primal_feasibility_tolerance": digits, "dual_feasibility_tolerance": 1e-10}
-    # Easy to get wrong: where the agent may stay for nothing V ≥ 0. At discount 1 the constraint of
-    # an action that stays in s for nothing, V(s) ≥ 0 + V(s), does not say so.
+    # Easy to get wrong: where the agent can stay for ever for nothing, V ≥ 0. At discount 1 the
+    # inequality of an action that stays in s, V(s) ≥ 0 + V(s), does not say so.
     bounds = [(0 if idle.any() else None, None) for idle in idle_actions(P, R).T]  # (S, 2)
     program = optimize.linprog(np.ones(len(bounds)), A, b, bounds=bounds, options=tolerances)
-    # Infeasible: no finite V is large enough, V* is +∞ somewhere. Unbounded: somewhere none is too
-    # small, V* is -∞.
+    # Infeasible: no finite V is large enough, V* is +∞ somewhere. Unbounded: V can fall without
+    # limit, V* is -∞ somewhere.
     if program.x is None:
         raise SystemExit(f"error: V* is not found: {program.message.splitlines()[0]}")
     return program.x, int(program.nit)  # (S,)
@@ -106,28 +109,35 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return np.add(R, Q, out=Q)  # R + Q without a copy, which at 10^6 states is a third of the time
 
 
-def greedy_policy(P, R, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At discount 1: π (S,) int and where it may end (S,) bool. Of the best actions that tie, π
-    takes one that soonest ends, or rests for nothing."""
-    V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that soonest ends, or
+    rests for nothing.
+
+    Exits if a state has a value, and none of its best actions ever leads to an end.
+    """
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
     # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) the chance to end
-    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S) an end, too: V stays 0
+    V = Q.max(axis=0)  # (S,)
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # It rests, which counts as an end, where it gets no reward and only states worth 0 follow.
+    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S)
     V_end, V_old = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(V_end, V_old):
-        Q_end = np.where(tied, 0.995 * np.where(rests, 1, backup(P, ends, V_end, 1)), -1)  # (A, S)
+    while not np.array_equal(V_end, V_old):  # until the 16 digits of a number are the same
+        Q_end = 0.995 * np.where(rests, 1, backup(P, ends, V_end, discount=1))  # (A, S)
+        Q_end[~tied] = -1
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
-    return Q_end.argmax(axis=0), V_end > 0
+    if (np.abs(V[V_end == 0]) > 1e-9).any():
+        raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
+    return Q_end.argmax(axis=0)  # (S,)
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: actions whose expected reward is 0, and that end or lead to states alone where
-    some action is idle again: the agent may rest there for ever."""
-    idle, before = np.ones(R.shape[1], bool), None  # (S,)
+    """(A, S) bool: the actions of the largest set of states in which the agent can stay for ever
+    for nothing. Such an action has no reward, and leads to states of the set alone, or ends."""
+    idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
-        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
+        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S) no reward, no way out
         idle, before = actions.any(axis=0), idle
     return actions
 
@@ -143,7 +153,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
+        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -163,19 +173,19 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     """
     A, S = max(map(len, model.values())), len(model)
     P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
-    index = {s: i for i, s in enumerate(model)}
-    for s, i in index.items():
-        for k, (a, transitions) in enumerate(model[s].items()):
+    number = {state: s for s, state in enumerate(model)}
+    for state, s in number.items():
+        for a, (action, transitions) in enumerate(model[state].items()):
             try:
-                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
-                for p, s_next, _, terminated in transitions:
+                R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, next_state, _, terminated in transitions:
                     if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[k * S + i, index[str(s_next)]] += going_on
+                        P[a * S + s, number[str(next_state)]] += going_on
                 p = [transition[0] for transition in transitions]
-                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
             except Exception:  # wrong numbers, an unknown next state, or not four values
-                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+                raise SystemExit(f"error: {action} in {state}: invalid {transitions}") from None
     return P.tocsr(), R
 
 
@@ -187,8 +197,8 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
-    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
-    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
+    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -221,9 +231,7 @@ def main(args: Args) -> None:
                 print(f"V({s}) ≥ {worked(transitions, args.discount, unknowns)}")
         print()
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    policy = Q.argmax(axis=0)  # (S,)
-    if args.discount == 1:
-        policy, _ = greedy_policy(P, R, Q)
+    policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     report(args.output_json, model, V, Q, policy, iterations)
 
 

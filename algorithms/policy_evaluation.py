@@ -42,7 +42,7 @@ from tqdm import trange
 
 @dataclass
 class Args:
-    """V and rewards have the same unit; a sweep is over all states."""
+    """A sweep is over all states. V is a sum of rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -55,12 +55,12 @@ class Args:
     policy: str = ""
     """such as "s0=a2 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
-    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
+    error of V may be γ / (1 - γ) times as large"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
-    """write values, action values and policy to this file"""
+    """write values, action values and policy to this file (the last, if there are three)"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
@@ -71,7 +71,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
+# belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -92,39 +93,39 @@ def policy_evaluation(P, R, policy, args: Args) -> tuple[np.ndarray, np.ndarray,
     π (S,) int is -1, and V is NaN, in states that it does not reach.
     """
     states = np.flatnonzero(policy >= 0)  # (n,)
-    rows = policy[states] * len(policy) + states  # (n,)
+    rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
     P_π, R_π = P[rows][:, states], R[policy[states], states]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
-    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
+    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]  # (m,), (m, m), (m,)
     V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
-    exact, zeros = V.copy(), np.zeros(len(states))  # (S,), (n,)
-    limits = args.discount, args.tolerance, args.max_iterations
-    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, zeros, *limits)
+    exact = V.copy()  # (S,)
+    V[states], sweeps = iterative_policy_evaluation(P_π, R_π, np.zeros(len(states)), args)
     exact[states] = solve_system(P_π, R_π, args.discount)
     return V, exact, sweeps
 
 
-def iterative_policy_evaluation(P, R, V, discount: float, tolerance: float, max_iterations: int):
+def iterative_policy_evaluation(P, R, V, args: Args) -> tuple[np.ndarray, int]:
     """Algorithm 1 from V (n,): V^π (n,), and the number of sweeps.
 
-    P (n, n) and R (n,) are the policy's own. Exits if V has not converged after max_iterations.
+    P (n, n) and R (n,) are the policy's own. Exits if V has not converged after --max-iterations.
     """
-    for sweep in trange(1, max_iterations + 1, desc="sweeps", delay=2, leave=False):
+    for sweep in trange(1, args.max_iterations + 1, desc="sweeps", delay=2, leave=False):
         # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
-        V, V_old = R + discount * (P @ V), V  # (n,)
-        if (np.abs(V - V_old) <= tolerance * np.maximum(1, np.abs(V))).all():
+        V, V_old = R + args.discount * (P @ V), V  # (n,)
+        if (np.abs(V - V_old) <= args.tolerance * np.maximum(1, np.abs(V))).all():
             return V, sweep
-    raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
+    raise SystemExit(f"error: V has not converged in {args.max_iterations} sweeps")
 
 
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
-    A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
-    if len(R) > 1000:  # a large system: approach V step by step, which is quick; else solve exactly
+    # (I - γ P) V = R
+    A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
+    if len(R) > 1000:  # large: an iterative solver, for the factors of a direct one fill the memory
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R) if len(R) else R  # (n,), which may be 0
+    return linalg.spsolve(A, R) if len(R) else R  # (n,); n may be 0
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
@@ -136,10 +137,10 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
     """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    reached, before = goal, None
-    while not np.array_equal(reached, before):
-        reached, before = reached | (P @ reached > 0), reached
-    return reached
+    may, before = goal, None  # in 0 steps
+    while not np.array_equal(may, before):
+        may, before = may | (P @ may > 0), may  # in one step more
+    return may
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -149,8 +150,9 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     """
     if discount < 1:
         return np.ones(len(R), bool)
-    # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
-    live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
+    # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
+    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
     # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
@@ -169,7 +171,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
+        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -189,19 +191,19 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     """
     A, S = max(map(len, model.values())), len(model)
     P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
-    index = {s: i for i, s in enumerate(model)}
-    for s, i in index.items():
-        for k, (a, transitions) in enumerate(model[s].items()):
+    number = {state: s for s, state in enumerate(model)}
+    for state, s in number.items():
+        for a, (action, transitions) in enumerate(model[state].items()):
             try:
-                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
-                for p, s_next, _, terminated in transitions:
+                R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, next_state, _, terminated in transitions:
                     if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[k * S + i, index[str(s_next)]] += going_on
+                        P[a * S + s, number[str(next_state)]] += going_on
                 p = [transition[0] for transition in transitions]
-                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
             except Exception:  # wrong numbers, an unknown next state, or not four values
-                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+                raise SystemExit(f"error: {action} in {state}: invalid {transitions}") from None
     return P.tocsr(), R
 
 
@@ -226,8 +228,8 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
-    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
-    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
+    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -269,14 +271,15 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
 def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else: the first
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else state 0
     named = args.policy or args.model or args.env_id  # else π1, π2 and π3 of §3.2
     texts = [args.policy] if named else ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]
     for text in texts:
         policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
-        # The policy graph (§3.2): the states that may be reached from the start, so P is turned
-        # round. Where π is -1, this reads a row of the last action: to come there is an error.
-        reached = may_reach(P[policy * len(model) + np.arange(len(model))].T, start > 0)  # (S,)
+        # The policy graph (§3.2): the states that the start leads to. Backwards, by the transpose,
+        # they reach the start. To come where π is -1 is an error, so any row of P will do there.
+        rows = policy * len(model) + np.arange(len(model))  # (S,) of P: a·S + s
+        reached = may_reach(P[rows].T, start > 0)  # (S,)
         if policy[reached].min() < 0:
             raise SystemExit("error: --policy comes to a state for which it names no action")
         policy = np.where(reached, policy, -1)  # (S,)

@@ -17,8 +17,8 @@ Measured
 
 Deviations
     An action is changed only for a gain: of actions that tie, an argmax may change for ever.
-    The first policy is not random but, without --initial-policy, one that ends, or stays somewhere
-    for nothing, if it can: at discount 1 another has no value.
+    The first policy is not random. At discount 1 a policy that collects for ever has no value, so
+    the first one ends, or stays somewhere for nothing; at another discount it is the first action.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
@@ -40,7 +40,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V, Q and rewards have the same unit; an iteration evaluates and improves a policy."""
+    """An iteration evaluates and improves a policy. V and Q are sums of rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -66,7 +66,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
+# belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -113,20 +114,21 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
 
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
-    A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n) (I - γ P) V = R
-    if len(R) > 1000:  # a large system: approach V step by step, which is quick; else solve exactly
+    # (I - γ P) V = R
+    A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
+    if len(R) > 1000:  # large: an iterative solver, for the factors of a direct one fill the memory
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
-    return linalg.spsolve(A, R) if len(R) else R  # (n,), which may be 0
+    return linalg.spsolve(A, R) if len(R) else R  # (n,); n may be 0
 
 
 def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
     """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    reached, before = goal, None
-    while not np.array_equal(reached, before):
-        reached, before = reached | (P @ reached > 0), reached
-    return reached
+    may, before = goal, None  # in 0 steps
+    while not np.array_equal(may, before):
+        may, before = may | (P @ may > 0), may  # in one step more
+    return may
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -136,8 +138,9 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     """
     if discount < 1:
         return np.ones(len(R), bool)
-    # Easy to get wrong: where a policy never ends, I - P is singular and sweeps may not converge.
-    live = may_reach(P, np.abs(R) > 1e-9)  # something may still be collected
+    # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
+    # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
+    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
     # An end: a transition that terminates, or a state after which nothing is collected.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
@@ -145,28 +148,35 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     return live
 
 
-def greedy_policy(P, R, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At discount 1: π (S,) int and where it may end (S,) bool. Of the best actions that tie, π
-    takes one that soonest ends, or rests for nothing."""
-    V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that soonest ends, or
+    rests for nothing.
+
+    Exits if a state has a value, and none of its best actions ever leads to an end.
+    """
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
     # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) the chance to end
-    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S) an end, too: V stays 0
+    V = Q.max(axis=0)  # (S,)
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # It rests, which counts as an end, where it gets no reward and only states worth 0 follow.
+    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S)
     V_end, V_old = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(V_end, V_old):
-        Q_end = np.where(tied, 0.995 * np.where(rests, 1, backup(P, ends, V_end, 1)), -1)  # (A, S)
+    while not np.array_equal(V_end, V_old):  # until the 16 digits of a number are the same
+        Q_end = 0.995 * np.where(rests, 1, backup(P, ends, V_end, discount=1))  # (A, S)
+        Q_end[~tied] = -1
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
-    return Q_end.argmax(axis=0), V_end > 0
+    if (np.abs(V[V_end == 0]) > 1e-9).any():
+        raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
+    return Q_end.argmax(axis=0)  # (S,)
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: actions whose expected reward is 0, and that end or lead to states alone where
-    some action is idle again: the agent may rest there for ever."""
-    idle, before = np.ones(R.shape[1], bool), None  # (S,)
+    """(A, S) bool: the actions of the largest set of states in which the agent can stay for ever
+    for nothing. Such an action has no reward, and leads to states of the set alone, or ends."""
+    idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
-        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
+        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S) no reward, no way out
         idle, before = actions.any(axis=0), idle
     return actions
 
@@ -182,7 +192,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
+        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -202,19 +212,19 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     """
     A, S = max(map(len, model.values())), len(model)
     P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
-    index = {s: i for i, s in enumerate(model)}
-    for s, i in index.items():
-        for k, (a, transitions) in enumerate(model[s].items()):
+    number = {state: s for s, state in enumerate(model)}
+    for state, s in number.items():
+        for a, (action, transitions) in enumerate(model[state].items()):
             try:
-                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
-                for p, s_next, _, terminated in transitions:
+                R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, next_state, _, terminated in transitions:
                     if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[k * S + i, index[str(s_next)]] += going_on
+                        P[a * S + s, number[str(next_state)]] += going_on
                 p = [transition[0] for transition in transitions]
-                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
             except Exception:  # wrong numbers, an unknown next state, or not four values
-                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+                raise SystemExit(f"error: {action} in {state}: invalid {transitions}") from None
     return P.tocsr(), R
 
 
@@ -246,8 +256,8 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
-    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
-    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
+    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -273,10 +283,10 @@ def main(args: Args) -> None:
     text = args.initial_policy or ("" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1")  # π2
     policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
     if args.discount == 1 and not text:
-        # Easy to get wrong: at discount 1 the first policy needs a value. It rests where that costs
-        # nothing. Elsewhere all actions tie, and the rule for ties takes the way that soonest ends.
-        tie = np.where(np.isfinite(R), -1, R)  # (A, S) Q of nothing but ties
-        policy, _ = greedy_policy(P, R, Q=np.where(idle_actions(P, R), 0, tie))
+        # Easy to get wrong: at discount 1 the first policy needs a value. Idle actions are the best
+        # here, Q = 0. All others tie at -1, and proper_policy takes the way that soonest ends.
+        tie = np.where(np.isfinite(R), -1, R)  # (A, S), -∞ where there is no action
+        policy = proper_policy(P, R, Q=np.where(idle_actions(P, R), 0, tie))
     if policy.min() < 0:
         raise SystemExit("error: --initial-policy needs an action in every state")
     steps = policy_iteration(P, R, policy, args.discount, args.max_iterations)

@@ -24,13 +24,13 @@ Measured, by `python benchmarks/gridworld.py seeds`
     200,000 episodes: Figure 10's policy for 20 of 20 seeds, with max |Q - Q*| from 0.006 to 0.028.
 
 Deviations from the lecture
-    Step reward   -0.025. The lecture's rewards are in lost pictures. Its Figure 10 is optimal,
+    Step reward   -0.025. The lecture's text does not name its rewards. Its Figure 10 is optimal,
                   undiscounted and with slip 0.2, exactly for step rewards from -0.0274 to -0.0221:
                   `python benchmarks/gridworld.py step-rewards` shows it.
     Convergence   --episodes of them: samples do not tell whether Q has converged.
     α             0.7 · N(s,a)^-0.85, N(s,a) visits: with a constant α, Q never settles.
-    ε             falls with each episode, from 1 to 0.7. Q-learning is off-policy, and a greedier
-                  robot hardly ever sees (4,1).
+    ε             falls with each episode, from 1 to 0.7. A greedier robot hardly ever sees (4,1),
+                  and Q-learning learns Q* whatever its robot does (it is off-policy).
     Discount      --discount, 1 by default as in Equation 34: other environments need one.
     Time limit    1,000 steps, where the environment has none: a policy may never end.
     Figure 9      "1000 interactions" are 1,000 episodes; 1,000 steps are about 30 episodes.
@@ -123,7 +123,8 @@ class GridWorld(gym.Env):
         self.P = {s: {a: self.outcomes(s, a, *rules) for a in range(4)} for s in range(11)}
 
     def outcomes(self, s: int, a: int, slip: float, step_reward: float) -> list[tuple]:
-        """What action `a` can lead to: [(P(s'|s,a), s', R(s,a,s'), terminated), …]."""
+        """What action `a` can lead to: [(P(s'|s,a), s', R(s,a,s'), terminated), …]. `slip` is the
+        probability of each of the two sides."""
         x, y = self.cells[s]
         if (x, y) in self.terminals:
             return [(1.0, s, 0.0, True)]  # the episode is over
@@ -184,11 +185,12 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
     Q = [[0.0] * A for _ in range(S)]  # lines 2-6; Python reads lists faster than arrays
     N = [[0] * A for _ in range(S)]  # N(s,a), visits
     env.reset(seed=int(seeds[0]))
-    # One ε for each episode, falling linearly from ε_initial to ε_final            # lines 1, 10-12
+    # A number of episodes, not until Q has converged (line 7). One ε for each, falling linearly
+    # from ε_initial to ε_final                                                     # lines 1, 10-12
     for epsilon in np.linspace(args.epsilon_initial, args.epsilon_final, args.episodes).tolist():
         s, _ = env.reset()
         total_reward, done = 0.0, False
-        while not done:  # line 7
+        while not done:
             # With probability ε a random action, else π(s) = argmax_a Q(s,a)            # lines 8-9
             if random() < epsilon:
                 a = int(random() * A)
@@ -277,7 +279,7 @@ def draw_action_values(axes: Axes, world: GridWorld, Q: np.ndarray, title: str) 
     for (x, y), values, best in zip(world.cells, Q, greedy(Q), strict=True):
         axes.text(x, y, arrows(best), fontsize=20 / best.sum(), weight="bold", **centred)
         for value, (dx, dy) in zip(values, world.moves.values(), strict=True):
-            # a triangle: the middle of the cell, and the two corners on the action's side
+            # a triangle: the cell's middle and two corners, for "right" (1/2, ±1/2) from there
             corners_x = [x, x + (dx - dy) / 2, x + (dx + dy) / 2]
             corners_y = [y, y + (dy + dx) / 2, y + (dy - dx) / 2]
             colour = colormaps["RdBu"](0.5 + value / scale)  # red < 0 < blue
@@ -312,6 +314,7 @@ def main() -> None:
         for episode, (Q, N, total_reward) in enumerate(learner, start=1):
             returns.append(total_reward)
             if episode % max(1, args.episodes // 200) == 0 or episode == args.episodes:
+                # what the curve shows: the return, or where there is a model the distance to Q*
                 label, score = "mean return", np.mean(returns[-100:])
                 writer.add_scalar(label, score, episode)
                 if model is not None:

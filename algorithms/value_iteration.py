@@ -20,10 +20,11 @@ Measured
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
     Of actions that tie, the policy takes one that ends soonest: at discount 1 an argmax may walk to
-    and fro for ever. Where V is held up at discount 1 (from V_0 = 0, costs may be seen later than a
-    way to stay for nothing), it is not V*: that is an error.
-    A transition that terminates adds no V(s'): a terminal state needs no entry in a model. Where
-    one has (FrozenLake's holes and goal), its V means nothing.
+    and fro for ever.
+    At discount 1 V_i may stop above V*: where +8 now costs 9 at the end, and the agent may stay for
+    nothing in between, V_1 = 8 is never seen to be too much. That is an error.
+    A transition that terminates adds no V(s'), so a model needs no terminal state. If it has one,
+    as FrozenLake its goal, its own V is not used.
 """
 
 import json
@@ -44,7 +45,7 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """V, Q and rewards have the same unit; an iteration is a sweep over all states."""
+    """An iteration is a sweep over all states. V and Q are sums of rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -55,8 +56,8 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more (relative to |V(s)|, if above 1) in a sweep;
-    its error may be larger, by about the length of an episode, or 1 / (1 - γ)"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
+    error of V may be γ / (1 - γ) times as large"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -73,10 +74,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
-WAYS = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
 
-# `arrays`, below, makes of it R (A, S) and P (A·S, S), sparse: S rows for each action. Figure 5:
+# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
+# belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -114,20 +114,27 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
     raise SystemExit(f"error: V has not converged in {max_iterations} sweeps")
 
 
-def greedy_policy(P, R, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At discount 1: π (S,) int and where it may end (S,) bool. Of the best actions that tie, π
-    takes one that soonest ends, or rests for nothing."""
-    V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that soonest ends, or
+    rests for nothing.
+
+    Exits if a state has a value, and none of its best actions ever leads to an end.
+    """
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
     # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) the chance to end
-    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S) an end, too: V stays 0
+    V = Q.max(axis=0)  # (S,)
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # It rests, which counts as an end, where it gets no reward and only states worth 0 follow.
+    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S)
     V_end, V_old = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(V_end, V_old):
-        Q_end = np.where(tied, 0.995 * np.where(rests, 1, backup(P, ends, V_end, 1)), -1)  # (A, S)
+    while not np.array_equal(V_end, V_old):  # until the 16 digits of a number are the same
+        Q_end = 0.995 * np.where(rests, 1, backup(P, ends, V_end, discount=1))  # (A, S)
+        Q_end[~tied] = -1
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
-    return Q_end.argmax(axis=0), V_end > 0
+    if (np.abs(V[V_end == 0]) > 1e-9).any():
+        raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
+    return Q_end.argmax(axis=0)  # (S,)
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
@@ -141,7 +148,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5, None
+        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -161,19 +168,19 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     """
     A, S = max(map(len, model.values())), len(model)
     P, R = sparse.lil_array((A * S, S)), np.full((A, S), -np.inf)
-    index = {s: i for i, s in enumerate(model)}
-    for s, i in index.items():
-        for k, (a, transitions) in enumerate(model[s].items()):
+    number = {state: s for s, state in enumerate(model)}
+    for state, s in number.items():
+        for a, (action, transitions) in enumerate(model[state].items()):
             try:
-                R[k, i] = sum(p * reward for p, _, reward, _ in transitions)
-                for p, s_next, _, terminated in transitions:
+                R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
+                for p, next_state, _, terminated in transitions:
                     if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[k * S + i, index[str(s_next)]] += going_on
+                        P[a * S + s, number[str(next_state)]] += going_on
                 p = [transition[0] for transition in transitions]
-                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[k, i])):
+                if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
             except Exception:  # wrong numbers, an unknown next state, or not four values
-                raise SystemExit(f"error: state {s}, action {a}: invalid {transitions}") from None
+                raise SystemExit(f"error: {action} in {state}: invalid {transitions}") from None
     return P.tocsr(), R
 
 
@@ -197,8 +204,8 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
-    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. NaN is undefined. The
-    Bellman residual is the largest |Q(s, π(s)) - V(s)|."""
+    """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
+    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -220,9 +227,11 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest change of V")
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), marker=".")
-    if ways := WAYS.get(type(env).__name__):
+    # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
+    grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
+    if ways := grids.get(type(env).__name__):
         acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, goal or cliff
-        cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # (rows, columns)
+        cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # CliffWalking: 12
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
         figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
         arrows = np.where(acts, np.array(ways)[policy], np.nan).reshape(cells.shape)
@@ -240,19 +249,14 @@ def main(args: Args) -> None:
     V, changes = value_iteration(P, R, args.discount, args.tolerance, args.max_iterations)
     Q = backup(P, R, V, args.discount)  # (A, S)
     # π*(s) = argmax_a Q*(s, a)  Equation 31
-    policy = Q.argmax(axis=0)  # (S,)
-    if args.discount == 1:
-        policy, ends = greedy_policy(P, R, Q)
-        # Staying for nothing where V_i was once too large, or a loop of +1 and -1, can hold V up.
-        if (np.abs(V[~ends]) > 1e-9).any():
-            raise SystemExit("error: V is held up by a loop without end; try policy_iteration.py")
+    policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
-        values, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
+        Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
         for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V
-            Q_i = backup(P, R, values[-1], args.discount)  # (A, S)
-            Q_rows.append(q_row(model, Q_i, values[-1], args.discount))
-            values.append(Q_i.max(axis=0))  # (S,)
-        print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V] for V in values])
+            Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
+            Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))
+            Vs.append(Q_i.max(axis=0))  # (S,)
+        print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V_i] for V_i in Vs])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
     report(args.output_json, model, V, Q, policy, len(changes))
     if args.figure:

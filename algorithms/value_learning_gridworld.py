@@ -7,9 +7,10 @@
 # ///
 """Value learning: V of a fixed policy in GridWorld without its model (Table 1, fourth cell), TD(0).
 
-The lecture names value learning in Table 1 and shows no algorithm. TD(0) is to policy evaluation
-(Algorithm 1) what Q-learning is to value iteration. The sum over s' in Equation 3 becomes the one
-s' that came, and the assignment a running average:
+The lecture names value learning in Table 1 and shows no algorithm. TD(0), temporal-difference
+learning from a single step, is to policy evaluation (Algorithm 1) what Q-learning is to value
+iteration. The sum over s' in Equation 3 becomes the one s' that came, and the assignment a running
+average:
 
     V(s) = (1 - α) V(s) + α (r + γ V(s'))
 
@@ -115,7 +116,8 @@ class GridWorld(gym.Env):
         self.P = {s: {a: self.outcomes(s, a, *rules) for a in range(4)} for s in range(11)}
 
     def outcomes(self, s: int, a: int, slip: float, step_reward: float) -> list[tuple]:
-        """What action `a` can lead to: [(P(s'|s,a), s', R(s,a,s'), terminated), …]."""
+        """What action `a` can lead to: [(P(s'|s,a), s', R(s,a,s'), terminated), …]. `slip` is the
+        probability of each of the two sides."""
         x, y = self.cells[s]
         if (x, y) in self.terminals:
             return [(1.0, s, 0.0, True)]  # the episode is over
@@ -191,15 +193,15 @@ def value_learning(env: gym.Env, policy: dict, args: Args) -> Iterator[tuple[lis
 
 def exact_values(world: GridWorld, policy: dict[int, int], discount: float) -> np.ndarray:
     """V^π (S,) float64 of Equations 2 and 3. Raises SystemExit if it is not finite."""
-    P = np.zeros((11, 11))  # (S, S), P(s'|s,π(s)) of the steps that do not end the episode
-    R = np.zeros(11)  # (S,), expected reward
+    # P(s'|s,π(s)) (S, S) of the steps that do not end the episode, and the expected reward (S,)
+    P, R = np.zeros((11, 11)), np.zeros(11)
     for s, a in policy.items():
         for probability, s_next, r, terminated in world.P[s][a]:
             R[s] += probability * r
             P[s, s_next] += 0 if terminated else probability
     ends = P.sum(axis=1) < 1 - 1e-9  # (S,) bool: the episode may end with the next step
     for _ in world.cells:
-        ends |= P @ ends > 1e-9  # or with a later one, at most as many as there are cells
+        ends |= P @ ends > 1e-9  # or a step later; the longest way has as many steps as cells
     if discount == 1 and not ends.all():
         raise SystemExit("error: from some cell the policy never ends: no finite V at discount 1")
     # V^π(s) = Σ_s' P(s'|s,π(s)) [R(s,π(s),s') + γ V^π(s')], that is (I - γP) V = R    Equations 2-3
@@ -228,13 +230,14 @@ def draw_values(axes: Axes, world: GridWorld, V: np.ndarray, policy: dict, title
     """V (S,) as colours and numbers, and the policy {s: a} as arrows."""
     scale = 3.2 * max(1, np.abs(V).max())  # 3.2: colours stay pale enough for black text
     for s, (x, y) in enumerate(world.cells):
-        value, text = world.terminals.get((x, y)), ""  # of an end
         if s in policy:
             value, text = V[s], "←↑→↓"[policy[s]]
             axes.text(x, y - 0.3, f"{value:.3f}", fontsize=11, ha="center")
+        else:  # an end
+            value, text = world.terminals[x, y], f"{world.terminals[x, y]:+g}"
         colour = colormaps["RdBu"](0.5 + value / scale)  # red < 0 < blue
         axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6)  # a square
-        axes.text(x, y, text or f"{value:+g}", fontsize=24, weight="bold", ha="center", va="center")
+        axes.text(x, y, text, fontsize=24, weight="bold", ha="center", va="center")
     axes.set(xticks=[1, 2, 3, 4], yticks=[1, 2, 3], aspect="equal", facecolor="0.8", title=title)
     axes.set(xlim=(0.3, 4.7), ylim=(0.3, 3.7))
 
