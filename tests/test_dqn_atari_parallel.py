@@ -259,7 +259,6 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     assert torch.equal(first["before"], saved["q_network"]["head.weight"])
     counters = read_checkpoint(run_dir)["counters"]
     assert (counters["frames"], counters["updates"]) == (frames + 140, updates + (140 - 100) // 4)
-    content = (run_dir / "checkpoint.pt").read_bytes()
-    (run_dir / "checkpoint.pt").write_bytes(content[: len(content) // 2])
+    os.truncate(run_dir / "checkpoint.pt", 5000)
     with pytest.raises(SystemExit, match="cannot be resumed"):
         parallel.main(parallel.Args(**flags))

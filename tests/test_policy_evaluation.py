@@ -1,7 +1,5 @@
 """policy_evaluation.py: §3.2 as printed, policies that never end; bad input of the five scripts."""
 
-import re
-
 import numpy as np
 import policy_evaluation as script
 import pytest
@@ -81,6 +79,10 @@ class TestEveryScript:
         model = {"s": {"a": [go("goal")]}, "here": {"this": transitions}}
         assert "here" in (line := refused(script, tmp_path, model)) and "this" in line
 
+    def test_large_values_whose_last_digits_alternate(self, script, tmp_path):
+        model = {"s": {"on": [go("t", 1e6)]}, "t": {"on": [go("s", -1e6)]}}
+        assert run(script, tmp_path, model, discount=0.9)["values"]["s"] == pytest.approx(1e6 / 1.9)
+
     def test_no_model(self, script, tmp_path):
         refused(script, tmp_path, {"s": {"a": [go("here")]}, "here": {}})
         found = run(script, tmp_path, {"s": {"a": [go("goal")]}, "goal": {}})  # the lecture's s_G
@@ -90,8 +92,8 @@ class TestEveryScript:
 
     def test_command_line(self, script, command_line, tmp_path):
         done = command_line(f"{script.__name__}.py")
-        assert (done.returncode, done.stderr) == (0, "")
-        assert re.search("^s0 +11 +a1$", done.stdout, re.MULTILINE)
+        printed = " ".join(done.stdout.split())
+        assert (done.returncode, done.stderr) == (0, "") and "s0 11 a1" in printed
         (tmp_path / "bad.json").write_text('{"s": {"a": [[1, "goal", NaN, true]]}}')
         done = command_line(f"{script.__name__}.py", "--model=bad.json", "--output-json=out.json")
         assert done.returncode == 1 and done.stderr.count("\n") == 1 and not done.stdout
