@@ -74,7 +74,6 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-
 # `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
 # belongs to action a in state s. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
