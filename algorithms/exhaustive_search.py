@@ -197,8 +197,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
-            env = gym.make(args.env_id, **kwargs).unwrapped
-            model = env.P
+            model = (env := gym.make(args.env_id, **kwargs).unwrapped).P
         # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         return model, env, *arrays(model)
@@ -219,8 +218,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[a * S + s, number[str(next_state)]] += going_on
+                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                        P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
@@ -229,20 +228,21 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
     return P.tocsr(), R
 
 
-def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
+    never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,
-        "residual": float(np.nanmax(np.abs(Q[policy, np.arange(len(V))] - V))),
+        "residual": float(residual),
     }
-    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]}).head(20)
-    print(table.to_string(float_format="{:.12g}".format, na_rep="undefined"))
-    print(f"{iterations} iterations, Bellman residual {solution['residual']:.2g}")
+    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]})
+    print(table.to_string(max_rows=20, float_format="{:.12g}".format, na_rep="undefined"))
+    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
@@ -260,7 +260,9 @@ def main(args: Args) -> None:
         print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")
     _, sweeps, sweeps_from_0 = np.sum(tried, axis=0)
     print(f"{len(tried)} policies, {sweeps:.0f} sweeps, {sweeps_from_0:.0f} from V = 0\n")
-    report(args.output_json, model, V, backup(P, R, V, args.discount), policy, len(tried))
+    Q = backup(P, R, V, args.discount)  # (A, S)
+    residual = np.nanmax(np.abs(Q[policy, np.arange(len(V))] - V))
+    report(args.output_json, model, V, Q, policy, len(tried), residual)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ Measured
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
-    At discount 1 V is 0 where nothing more is collected; a policy that may collect for ever has no
-    value. V is undefined where the policy never comes.
+    At discount 1 V is 0 where nothing more is collected (rewards below 1e-9 count as none); a
+    policy that may collect for ever has no value. V is undefined where the policy never comes.
 """
 
 import json
@@ -60,7 +60,7 @@ class Args:
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
-    """write values, action values and policy to this file (the last, if there are three)"""
+    """write values, action values and policy to this file (π3's, without --policy)"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
@@ -175,8 +175,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
-            env = gym.make(args.env_id, **kwargs).unwrapped
-            model = env.P
+            model = (env := gym.make(args.env_id, **kwargs).unwrapped).P
         # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         return model, env, *arrays(model)
@@ -197,8 +196,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[a * S + s, number[str(next_state)]] += going_on
+                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                        P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
@@ -218,7 +217,7 @@ def read_policy(text: str, model: dict) -> np.ndarray:
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
     """Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')] as text, `0.6·[10 + 0] + 0.4·[5 + 0]`."""
     γ = "" if discount == 1 else f"{discount:g}·"
-    terms = [f"{p:g}·[{r:g} + {γ}{'0' if end else V[str(s)]}]" for p, s, r, end in transitions]
+    terms = [f"{p:g}·[{r:.9g} + {γ}{'0' if end else V[str(s)]}]" for p, s, r, end in transitions]
     return " + ".join(terms)
 
 
@@ -227,20 +226,21 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
     print(pd.DataFrame(rows, columns=header).rename_axis(columns="i").to_string(), "\n")
 
 
-def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
+    never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,
-        "residual": float(np.nanmax(np.abs(Q[policy, np.arange(len(V))] - V))),
+        "residual": float(residual),
     }
-    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]}).head(20)
-    print(table.to_string(float_format="{:.12g}".format, na_rep="undefined"))
-    print(f"{iterations} iterations, Bellman residual {solution['residual']:.2g}")
+    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]})
+    print(table.to_string(max_rows=20, float_format="{:.12g}".format, na_rep="undefined"))
+    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
@@ -253,14 +253,14 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
     unknowns = {s: f"V({s})" for s in model}
     for s, v in zip(chosen, exact[policy >= 0], strict=True):
         fraction = Fraction(v).limit_denominator(10_000)
-        text = fraction if np.isclose(float(fraction), v, rtol=1e-12, atol=0) else f"{v:.12g}"
+        text = fraction if abs(fraction - v) <= 1e-12 else f"{v:.12g}"
         print(f"V({s}) = {worked(chosen[s], discount, unknowns)} = {text}")
     print()
     table, V = [["0"] * len(chosen)], np.zeros(len(model))  # (S,)
     for _ in range(min(sweeps, 9)):  # once more, to be printed
-        texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
+        texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
         V = np.where(policy >= 0, backup(P, R, V, discount)[policy, np.arange(len(V))], 0)  # (S,)
-        cells = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
+        cells = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
         table.append([f"{worked(chosen[s], discount, texts)} = {cells[s]}" for s in chosen])
     print_table([f"V_i({s})" for s in chosen], table)
 
@@ -286,7 +286,9 @@ def main(args: Args) -> None:
         V, exact, sweeps = policy_evaluation(P, R, policy, args)
         if R.size <= 12:  # small enough to be worked through on paper
             print_evaluation(model, P, R, policy, args.discount, exact, sweeps)
-        report(args.output_json, model, V, backup(P, R, V, args.discount), policy, sweeps)
+        path = args.output_json if text == texts[-1] else None
+        Q = backup(P, R, V, args.discount)  # (A, S)
+        report(path, model, V, Q, policy, sweeps, np.abs(Q.ravel()[rows] - V)[reached].max())
         print(f"The linear system differs by {np.abs(V - exact)[reached].max():.2g}\n")
 
 

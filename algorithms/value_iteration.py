@@ -15,12 +15,12 @@ Run it
 
 Measured
     The first command converges in 4 sweeps to V* = (11, 1, 4) and π* = (a1, a1, a2). FrozenLake-v1
-    at discount 1: V(0) = 0.823529411742, 14/17, after 993 sweeps.
+    at discount 1: V(0) = 0.8235294117, 14/17, after 993 sweeps.
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
-    Of actions that tie, the policy takes one that ends soonest: at discount 1 an argmax may walk to
-    and fro for ever.
+    At discount 1, of actions that tie, the policy takes one that ends: an argmax may walk to and
+    fro for ever. Values that differ by less than 1e-9 tie, rewards below 1e-9 count as none.
     At discount 1 V_i may stop above V*: where +8 now costs 9 at the end, and the agent may stay for
     nothing in between, V_1 = 8 is never seen to be too much. That is an error.
     A transition that terminates adds no V(s'), so a model needs no terminal state. If it has one,
@@ -114,22 +114,25 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that soonest ends, or
+    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that ends, and soon, or
     rests for nothing.
 
     Exits if a state has a value, and none of its best actions ever leads to an end.
     """
-    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # by value iteration again: of the tied actions alone, an end is worth 1, and γ = 0.995.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
+    # The largest set of states worth 0 in which the agent can stay for ever for nothing: at first
+    # all, then those from which a best action without a reward leads to states of the set alone.
+    rest, before = np.abs(V) <= 1e-9, None  # (S,)
+    while not np.array_equal(rest, before):
+        rests = backup(P, np.where(tied, np.abs(R), np.inf), ~rest, discount=1) <= 1e-9  # (A, S)
+        rest, before = rest & rests.any(axis=0), rest
+    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
+    # by value iteration again: of the tied actions alone, an end or a rest is worth 1, γ = 0.995.
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
-    # It rests, which counts as an end, where it gets no reward and only states worth 0 follow.
-    rests = backup(P, np.abs(R), np.abs(V), discount=1) <= 1e-9  # (A, S)
-    V_end, V_old = np.zeros(len(V)), None  # (S,)
-    while not np.array_equal(V_end, V_old):  # until the 16 digits of a number are the same
-        Q_end = 0.995 * np.where(rests, 1, backup(P, ends, V_end, discount=1))  # (A, S)
-        Q_end[~tied] = -1
+    R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
+    while not np.array_equal(V_end, V_old):  # until no digit of a float64 changes
+        Q_end = 0.995 * np.where(rests, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
         raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
@@ -151,8 +154,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
-            env = gym.make(args.env_id, **kwargs).unwrapped
-            model = env.P
+            model = (env := gym.make(args.env_id, **kwargs).unwrapped).P
         # Names are text, as in JSON. A state without an action is terminal.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         return model, env, *arrays(model)
@@ -173,8 +175,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if going_on := p * (1 - terminated):  # nothing comes after an end
-                        P[a * S + s, number[str(next_state)]] += going_on
+                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                        P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
                     raise ValueError
@@ -186,7 +188,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
     """Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')] as text, `0.6·[10 + 0] + 0.4·[5 + 0]`."""
     γ = "" if discount == 1 else f"{discount:g}·"
-    terms = [f"{p:g}·[{r:g} + {γ}{'0' if end else V[str(s)]}]" for p, s, r, end in transitions]
+    terms = [f"{p:g}·[{r:.9g} + {γ}{'0' if end else V[str(s)]}]" for p, s, r, end in transitions]
     return " + ".join(terms)
 
 
@@ -197,25 +199,26 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
     """A row of the lecture's table of Q_i(s, a) (A, S), worked out from V_i (S,)."""
-    texts = {s: f"{round(v, 2):g}" for s, v in zip(model, V, strict=True)}
+    texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
     pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
-    return [f"{worked(t, discount, texts)} = {round(q, 2):g}" for t, q in pairs]
+    return [f"{worked(t, discount, texts)} = {round(q, 2):.9g}" for t, q in pairs]
 
 
-def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> None:
+def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |Q(s, π(s)) - V(s)|. States where a policy never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
+    never comes have V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,
-        "residual": float(np.nanmax(np.abs(Q[policy, np.arange(len(V))] - V))),
+        "residual": float(residual),
     }
-    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]}).head(20)
-    print(table.to_string(float_format="{:.12g}".format, na_rep="undefined"))
-    print(f"{iterations} iterations, Bellman residual {solution['residual']:.2g}")
+    table = pd.DataFrame({"V(s)": solution["values"], "π(s)": solution["policy"]})
+    print(table.to_string(max_rows=20, float_format="{:.12g}".format, na_rep="undefined"))
+    print(f"{iterations} iterations, Bellman residual {residual:.2g}")
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(solution, indent=1) + "\n", "utf-8")
@@ -224,7 +227,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int) -> Non
 def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[float]) -> None:
     """Draw the changes and, of FrozenLake and CliffWalking, V (S,) as colours, π (S,) as arrows."""
     figure = Figure(figsize=(12, 4.5), layout="constrained")
-    axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest change of V")
+    axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest relative change of V")
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), marker=".")
     # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
     grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
@@ -255,9 +258,9 @@ def main(args: Args) -> None:
             Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))
             Vs.append(Q_i.max(axis=0))  # (S,)
-        print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):g}" for v in V_i] for V_i in Vs])
+        print_table([f"V_i({s})" for s in model], [[f"{round(v, 2):.9g}" for v in x] for x in Vs])
         print_table([f"Q_i({s}, {a})" for s in model for a in model[s]], Q_rows)
-    report(args.output_json, model, V, Q, policy, len(changes))
+    report(args.output_json, model, V, Q, policy, len(changes), np.abs(Q.max(axis=0) - V).max())
     if args.figure:
         save_figure(args.figure, env, P, V, policy, changes)
 

@@ -15,8 +15,8 @@ TRAPS = {  # at discount 1: V(s) of the four SOLVERS, N where one refuses
     "0 of 2": ([N, N, -9, -9], {"s": {"on": [go("t", -1)], "best": OUT}, "t": {"": [go("s", 1)]}}),
     "0 at rest": ([N, N, -9, -9], {"s": {"on": [go("s", -1, 0.5), go("t", -1, 0.5)], "best": OUT},
                                    "t": {"on": [go("s", 1, 0.5), go("t", 1, 0.5)]}}),
-    "0 of 3": ([N, 0, 0, 0], {"s": {"on": [go("u", -1)], "best": [go("goal")]},
-                              "t": {"back": TO_S}, "u": {"on": [go("t", 1)]}}),
+    "0 of 3": ([N, 0, 0, 0], {"s": {"on": [go("u")], "best": [go("goal")]},
+                              "t": {"back": [go("s", 1)]}, "u": {"on": [go("t", -1)]}}),
     "held up": ([0, N, 0, 0], {"s": {"stay": [go("s", 0, 0.7), go("s", 0, 0.2), go("s", 0, 0.1)],
                                      "on": [go("t", 8)]}, "t": {"out": OUT}}),  # .7 + .2 + .1 < 1
     "to stay is best": ([0, 0, 0, 0], {"s": {"out": OUT, "on": TO_T}, "t": {"back": TO_S}}),
