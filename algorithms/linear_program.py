@@ -117,11 +117,11 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     """
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
-    # The largest set of states worth 0 in which the agent can stay for ever for nothing: at first
-    # all, then those from which a best action without a reward leads to states of the set alone.
+    # The largest set of states worth 0 in which the agent can stay for ever: at first all, then
+    # those from which one of the best actions leads to states of the set alone.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        rests = backup(P, np.where(tied, np.abs(R), np.inf), ~rest, discount=1) <= 1e-9  # (A, S)
+        rests = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
         rest, before = rest & rests.any(axis=0), rest
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
     # by value iteration again: of the tied actions alone, an end or a rest is worth 1, γ = 0.995.
