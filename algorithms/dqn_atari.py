@@ -23,23 +23,25 @@ Run it
         --agent-epsilon-greedy-epsilon-final 0.1 --agent-replay-buffer-initial 50000 \
         --optimizer-q-network-parameter-update-interval-frames 40000
 
-Measured, on two cores of an AMD EPYC
+Measured, on two cores of an AMD EPYC, mean score of the final test, one seed
     Breakout, --environment-train-frames-max 560000 --agent-update-frequency 4
     --agent-epsilon-greedy-epsilon-final 0.02 --agent-epsilon-greedy-annealing 250000
-    --agent-replay-buffer-initial 20000: 41.71 after 54 minutes (the lecture's run: 32.154)
+    --agent-replay-buffer-initial 20000: 41.71 after 54 minutes (the lecture's, with a slower fall
+    of ε, after ten million frames: 32.154)
 
 Deviations
     lecture or [8]                        this file                           why
     ------------------------------------  ----------------------------------  --------------------
-    Algorithm 6 copies θ by episodes and  every 1,000 frames, every 500       Table 3 says so; the
-    evaluates by frames                   episodes                            two disagree
+    Algorithm 6 copies θ by episodes      every 1,000 frames                  Table 3 says so
+    Algorithm 6 evaluates by frames       every 500 episodes                  Table 3 says so
     squared error (Algorithm 6, line 22)  Huber loss                          §5.3
     [8]: acts at random before learning   ε falls from the first frame        Algorithm 6
     [8]: all weights uniform              orthogonal convolution filters      §7.5.1, Table 4
-    [8]: histories begin with zeros       with copies of the first frame      acting = replay
-    [8]: area-averaged screens            bilinear, without antialiasing: at  §7.2.1 says bilinear
-                                          84×84 every fifth row of the
-                                          screen has no weight
+    [8]: an episode's first states have   copies of its first frame           no state has a frame
+    empty frames before the first one                                         that no screen shows
+    [8]: screens averaged by area         bilinear, without antialiasing:     §7.2.1 says bilinear
+                                          every fifth row of a screen is
+                                          not seen
     raw frames, shared by reference       LZ4 frames, shared by reference     0.4 to 1.4 GB, not 11
 """
 
@@ -133,7 +135,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test, and the most of an evaluation [§7.3.3]"""
+    """frames of the final test [§7.3.3]; an evaluation stops after as many at the latest"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -157,7 +159,8 @@ def read_args() -> Args:
             defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
+        # Once more, with the run's own flags as defaults: no other flag may differ from them.
+        args = tyro.cli(Args, default=defaults)
         shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
         defaults.environment_train_frames_max = args.environment_train_frames_max
         if shorter or args != defaults:
@@ -236,8 +239,8 @@ class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
 
     Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
-    it reset the emulator, later lives would never be played; if it stepped, nobody would choose an
-    action.
+    it reset the emulator, later lives would never be played; if it played on with a no-operation,
+    that would be an action that the agent has not chosen.
     """
 
     def __init__(self, env: gym.Env):
@@ -297,6 +300,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
+    # Gymnasium asks for the space of what comes out; None is that of before, and nobody reads it.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -323,8 +327,8 @@ class ReplayMemory:
         return min(self.added, self.capacity)
 
     def add(self, s: tuple, a: int, r: float, s_next: tuple, terminal: bool) -> None:
-        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`, or a game
-        that was cut off teaches that its last state is worth nothing."""
+        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`. Otherwise a
+        game that was cut off teaches that its last state is worth nothing."""
         i = self.added % self.capacity
         self.frames[i] = (*s, s_next[-1])
         self.numbers[i] = a, r, terminal
@@ -340,11 +344,13 @@ class ReplayMemory:
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
+        # bytearray: of bytes, which cannot be written to, PyTorch makes a tensor with a warning.
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
     def state_dict(self) -> dict:
-        """For a checkpoint: every frame once, and per transition the places of its frames."""
+        """For a checkpoint: every frame once, and per transition the places of its frames. Two
+        transitions (A, B, C, D, E) and (B, C, D, E, F) become ABCDEF, 0 1 2 3 4 and 1 2 3 4 5."""
         stored = self.frames[: len(self)]  # a frame that transitions share is one object
         unique = {id(frame): frame for frames in stored for frame in frames}
         place = dict(zip(unique, range(len(unique)), strict=True))
@@ -387,7 +393,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
+        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -431,8 +437,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22: the constant in RMSProp's root [8] is made for it, and Adam's steps have no scale.
-    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
+    # in line 22 and [8], for whose RMSProp a mean would be too small; Adam divides the scale out.
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
     optimizer.zero_grad()
@@ -442,8 +448,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 
 class NatureRMSprop(torch.optim.Optimizer):
-    """The RMSProp that [8] released (Figure 18): centred, without momentum, its constant inside the
-    root, where PyTorch's is outside. Figure 18's "gradient momentum" is the decay of g, below."""
+    """The RMSProp that [8] released (Figure 18). PyTorch's has the constant outside the root. What
+    Figure 18 calls the gradient momentum is 0.95, the decay of the mean gradient g, below."""
 
     def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
         super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
@@ -458,6 +464,7 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
                 g = state["g"].lerp_(θ.grad, 1 - group["decay"])
                 n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
+                # (n - g² is a variance; rounding can make it negative)
                 root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
@@ -476,6 +483,7 @@ def choose_precision(args: Args) -> str:
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
+    # a.float() and a.bool() are r and terminal: all of the minibatch is 0.
     inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
     def seconds(precision: str) -> float:
@@ -553,7 +561,7 @@ def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple
     """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
     and how fast the first and the last tenth of the learning frames were."""
     evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
-    tenth = math.ceil(len(counters.speeds) / 10)
+    tenth = math.ceil(len(counters.speeds) / 10)  # a run that slows down shows here
     result = summary(counters, finished) | {
         "last_evaluations_score_mean": float(np.mean(evaluations)),
         "unfinished_score_and_length": unfinished,
@@ -590,7 +598,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember from frame to frame, and do not set anew."""
+    """What the emulator and the wrappers remember. A checkpoint is taken when a frame is over, and
+    `frame`, `info` and `game_over` are set anew before they are read."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
@@ -598,7 +607,8 @@ def environment_state(env: gym.Env) -> dict:
 
 def restore_environment(env: gym.Env, saved: dict) -> None:
     """Put `env` where `environment_state` was taken."""
-    # Easy to get wrong: before its first action the emulator takes no state whole (Q*bert, Tetris).
+    # Easy to get wrong: if the emulator has not acted yet, the frames after restoreState differ,
+    # from the first action on (in Q*bert and Tetris).
     env.reset()
     env.step(0)
     env.unwrapped.ale.restoreState(ale_py.ALEState(saved.pop("emulator")))
@@ -643,8 +653,8 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 
 def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind."""
-    # Adam's moments of dead units fade below 1e-38, where a CPU is 10 times slower: make them 0, in
-    # the threads, too, which inherit this from here on.
+    # For speed alone: Adam's moments of dead units fade below 1e-38, where a CPU is 10 times
+    # slower. They become 0, in the threads, too, which are started after this.
     torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())
     args.threads = torch.get_num_threads()  # into args.json: a resumed run has as many
@@ -680,7 +690,7 @@ def main(args: Args) -> None:
         counters = restore(run_dir / "checkpoint.pt", parts, env, rngs)
         s = env.get_wrapper_attr("history")
     write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
-    (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
+    (run_dir / "test.json").unlink(missing_ok=True)  # of the same run before it was lengthened
     # Points after the checkpoint are purged: they are drawn once more.
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
@@ -704,7 +714,7 @@ def main(args: Args) -> None:
         content["counters"] = vars(counters)
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    stop = []  # signals: the loop ends with the frame, or the evaluation, that it is at
+    stop = []  # signals so far: with one, the loop ends after the frame, or the evaluation
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
@@ -715,7 +725,7 @@ def main(args: Args) -> None:
 
     # 8, 30  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max and not stop:
-        counters.frames += 1
+        counters.frames += 1  # the number of the frame that is played now
 
         # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q(s, a; θ). Add (s, a, r, s') to 𝒟.
         epsilon = epsilon_at(counters.frames - 1, args)
@@ -779,7 +789,7 @@ def main(args: Args) -> None:
     save_checkpoint()
     if stop:
         print(f"frame {counters.frames:,}; go on with: python {sys.argv[0]} --resume {run_dir}")
-        raise SystemExit(128 + stop[0])
+        raise SystemExit(128 + stop[0])  # the shell's code for a signal
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     finished, unfinished = evaluate(args, q_network, replay.decode, number=0)

@@ -136,7 +136,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test, and the most of an evaluation [§7.3.3]"""
+    """frames of the final test [§7.3.3]; an evaluation stops after as many at the latest"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -160,7 +160,8 @@ def read_args() -> Args:
             defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        args = tyro.cli(Args, default=defaults)  # once more: now these are the defaults
+        # Once more, with the run's own flags as defaults: no other flag may differ from them.
+        args = tyro.cli(Args, default=defaults)
         shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
         defaults.environment_train_frames_max = args.environment_train_frames_max
         if shorter or args != defaults:
@@ -239,8 +240,8 @@ class LifeLoss(gym.Wrapper):
     """A lost life terminates the episode, and the game goes on (§7.2.1, training only).
 
     Easy to get wrong: after a lost life reset() returns the frame that the episode ended with. If
-    it reset the emulator, later lives would never be played; if it stepped, nobody would choose an
-    action.
+    it reset the emulator, later lives would never be played; if it played on with a no-operation,
+    that would be an action that the agent has not chosen.
     """
 
     def __init__(self, env: gym.Env):
@@ -300,6 +301,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
+    # Gymnasium asks for the space of what comes out; None is that of before, and nobody reads it.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -339,8 +341,8 @@ class ReplayShare:
         return min(self.added, self.capacity)
 
     def add(self, s: tuple, a: int, r: float, s_next: tuple, terminal: bool) -> None:
-        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`, or a game
-        that was cut off teaches that its last state is worth nothing."""
+        """Store (s, a, r, s'). Easy to get wrong: truncation does not set `terminal`. Otherwise a
+        game that was cut off teaches that its last state is worth nothing."""
         i = self.added % self.capacity
         self.frames[i] = (*s, s_next[-1])
         self.numbers[i] = a, r, terminal
@@ -356,7 +358,8 @@ class ReplayShare:
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
+        # bytearray: of bytes, which cannot be written to, PyTorch makes a tensor with a warning.
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
 
@@ -380,7 +383,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
+        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -432,8 +435,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22: the constant in RMSProp's root [8] is made for it, and Adam's steps have no scale.
-    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), and learns the minibatch's mean.
+    # in line 22 and [8], for whose RMSProp a mean would be too small; Adam divides the scale out.
+    # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
     optimizer.zero_grad()
@@ -519,8 +522,8 @@ def write_text(path: Path, text: str) -> None:
 
 def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -> None:
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
-    # Adam's moments of dead units fade below 1e-38, where a CPU is 10 times slower: make them 0, in
-    # the threads, too, which inherit this from here on.
+    # For speed alone: Adam's moments of dead units fade below 1e-38, where a CPU is 10 times
+    # slower. They become 0, in the threads, too, which are started after this.
     torch.set_flush_denormal(True)
 
     # 1  Initialize the Atari 2600 simulators.
@@ -560,7 +563,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
-        (run_dir / "test.json").unlink(missing_ok=True)  # of a run that was shorter
+        (run_dir / "test.json").unlink(missing_ok=True)  # of the same run before it was lengthened
         # Points after the checkpoint are purged: they are drawn once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")

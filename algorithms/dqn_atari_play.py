@@ -212,7 +212,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # where layers are bfloat16, Q is not
+        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
             return self.head(x.float())  # (B, num_actions)
 
 

@@ -53,8 +53,8 @@ class Args:
     max_policies: int = 10_000
     """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
-    error of V may be γ / (1 - γ) times as large"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1). Its
+    error may be larger: γ / (1 - γ) times the change, if γ < 1"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -175,7 +175,8 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
     live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected.
+    # An end: a transition that terminates, or a state after which nothing is collected. Where one
+    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
@@ -218,7 +219,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -230,8 +231,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
-    never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
+    instead, and for states where π never comes V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),

@@ -110,25 +110,26 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that ends, and soon, or
-    rests for nothing.
+    """At discount 1: π (S,) int. Of the best actions, which tie, π takes one that leads to an end
+    soon: the end of the episode, or states where it can stay for ever and V is 0.
 
-    Exits if a state has a value, and none of its best actions ever leads to an end.
+    Exits if the best actions of a state with another V never lead to an end.
     """
     V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
-    # The largest set of states worth 0 in which the agent can stay for ever: at first all, then
-    # those from which one of the best actions leads to states of the set alone.
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
+    # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
+    # those with a best action that leads into the set for certain, or ends (its row of P is empty).
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        rests = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
-        rest, before = rest & rests.any(axis=0), rest
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
+        rest, before = rest & to_rest.any(axis=0), rest
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # by value iteration again: of the tied actions alone, an end or a rest is worth 1, γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # which has the best actions alone, and whose one reward is 1 for an end, discounted to be soon:
+    # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # until no digit of a float64 changes
-        Q_end = 0.995 * np.where(rests, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
+    while not np.array_equal(V_end, V_old):  # V_end rises until a step is below a float's precision
+        Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
         raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
@@ -136,11 +137,12 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions of the largest set of states in which the agent can stay for ever
-    for nothing. Such an action has no reward, and leads to states of the set alone, or ends."""
+    """(A, S) bool: the actions without a reward that end, or lead for certain into the largest set
+    of states that the agent need never leave by such actions: to be idle is worth 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
-        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S) no reward, no way out
+        # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
+        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
         idle, before = actions.any(axis=0), idle
     return actions
 
@@ -181,7 +183,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -200,8 +202,8 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
-    never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
+    instead, and for states where π never comes V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),

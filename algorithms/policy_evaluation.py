@@ -55,8 +55,8 @@ class Args:
     policy: str = ""
     """such as "s0=a2 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
-    error of V may be γ / (1 - γ) times as large"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1). Its
+    error may be larger: γ / (1 - γ) times the change, if γ < 1"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -90,7 +90,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def policy_evaluation(P, R, policy, args: Args) -> tuple[np.ndarray, np.ndarray, int]:
     """V^π (S,) by Algorithm 1, V^π (S,) by the linear system, and the number of sweeps.
 
-    π (S,) int is -1, and V is NaN, in states that it does not reach.
+    π (S,) int reaches n states; in the others it is -1, and V is NaN. In m of the n states it may
+    still collect something; in the others V is 0.
     """
     states = np.flatnonzero(policy >= 0)  # (n,)
     rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
@@ -121,7 +122,9 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     # (I - γ P) V = R
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
-    if len(R) > 1000:  # large: an iterative solver, for the factors of a direct one fill the memory
+    # For a large system BiCGSTAB, which approaches V step by step, in little memory. If it does not
+    # get there, and for small ones, a direct solver, whose memory may grow with n².
+    if len(R) > 1000:
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
@@ -153,7 +156,8 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
     live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected.
+    # An end: a transition that terminates, or a state after which nothing is collected. Where one
+    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
@@ -196,7 +200,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -208,7 +212,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}, without =
+    # {state: action}, the parts before and after the last =
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())
     if unknown := chosen.items() - {(s, a) for s in model for a in model[s]}:
         raise SystemExit(f"error: {unknown} names no state and action of this model")
     return np.array([list(model[s]).index(chosen[s]) if s in chosen else -1 for s in model])
@@ -228,8 +233,8 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
-    never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
+    instead, and for states where π never comes V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -271,15 +276,16 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
 def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else state 0
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else 1, 0, …
     named = args.policy or args.model or args.env_id  # else π1, π2 and π3 of §3.2
     texts = [args.policy] if named else ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]
     for text in texts:
         policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
-        # The policy graph (§3.2): the states that the start leads to. Backwards, by the transpose,
-        # they reach the start. To come where π is -1 is an error, so any row of P will do there.
+        # The policy graph (§3.2): the states to which the start leads. In the transpose, where
+        # every step goes backwards, they are those that may reach the start.
         rows = policy * len(model) + np.arange(len(model))  # (S,) of P: a·S + s
         reached = may_reach(P[rows].T, start > 0)  # (S,)
+        # Where π is -1, `rows` has a row of the last action; to reach such a state is an error.
         if policy[reached].min() < 0:
             raise SystemExit("error: --policy comes to a state for which it names no action")
         policy = np.where(reached, policy, -1)  # (S,)
@@ -287,7 +293,7 @@ def main(args: Args) -> None:
         if R.size <= 12:  # small enough to be worked through on paper
             print_evaluation(model, P, R, policy, args.discount, exact, sweeps)
         path = args.output_json if text == texts[-1] else None
-        Q = backup(P, R, V, args.discount)  # (A, S)
+        Q = backup(P, R, V, args.discount)  # (A, S); NaN of actions that lead to unreached states
         report(path, model, V, Q, policy, sweeps, np.abs(Q.ravel()[rows] - V)[reached].max())
         print(f"The linear system differs by {np.abs(V - exact)[reached].max():.2g}\n")
 

@@ -13,11 +13,13 @@ Run it
     python algorithms/policy_iteration.py --initial-policy "s0=a2 s1=a1 s2=a2"
 
 Measured
-    The first command converges to V* = (11, 1, 4) and π* = (a1, a1, a2) with two policies.
+    The first command converges to V* = (11, 1, 4) and π* = (a1, a1, a2) with two policies; its
+    tables print the second twice, as the lecture's do.
 
 Deviations
     An action is changed only for a gain of more than 1e-9 (relative to |V(s)|, if above 1): of
-    actions that tie, an argmax may change for ever. What that leaves is the Bellman residual.
+    actions that tie, an argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed
+    as the Bellman residual.
     The first policy is not random. At discount 1 a policy that collects for ever has no value, so
     the first one ends, or stays somewhere for nothing; at another discount it is the first action.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
@@ -113,11 +115,16 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
     raise SystemExit(f"error: π has not converged in {max_iterations} iterations")
 
 
+# At discount 1, `proper_policy` and `idle_actions`, below, make the first policy.
+
+
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     # (I - γ P) V = R
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
-    if len(R) > 1000:  # large: an iterative solver, for the factors of a direct one fill the memory
+    # For a large system BiCGSTAB, which approaches V step by step, in little memory. If it does not
+    # get there, and for small ones, a direct solver, whose memory may grow with n².
+    if len(R) > 1000:
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
             return V
@@ -142,7 +149,8 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
     live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected.
+    # An end: a transition that terminates, or a state after which nothing is collected. Where one
+    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
     ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
@@ -150,25 +158,26 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that ends, and soon, or
-    rests for nothing.
+    """At discount 1: π (S,) int. Of the best actions, which tie, π takes one that leads to an end
+    soon: the end of the episode, or states where it can stay for ever and V is 0.
 
-    Exits if a state has a value, and none of its best actions ever leads to an end.
+    Exits if the best actions of a state with another V never lead to an end.
     """
     V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
-    # The largest set of states worth 0 in which the agent can stay for ever: at first all, then
-    # those from which one of the best actions leads to states of the set alone.
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
+    # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
+    # those with a best action that leads into the set for certain, or ends (its row of P is empty).
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        rests = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
-        rest, before = rest & rests.any(axis=0), rest
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
+        rest, before = rest & to_rest.any(axis=0), rest
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # by value iteration again: of the tied actions alone, an end or a rest is worth 1, γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # which has the best actions alone, and whose one reward is 1 for an end, discounted to be soon:
+    # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # until no digit of a float64 changes
-        Q_end = 0.995 * np.where(rests, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
+    while not np.array_equal(V_end, V_old):  # V_end rises until a step is below a float's precision
+        Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
         raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
@@ -176,11 +185,12 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions of the largest set of states in which the agent can stay for ever
-    for nothing. Such an action has no reward, and leads to states of the set alone, or ends."""
+    """(A, S) bool: the actions without a reward that end, or lead for certain into the largest set
+    of states that the agent need never leave by such actions: to be idle is worth 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
-        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S) no reward, no way out
+        # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
+        actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
         idle, before = actions.any(axis=0), idle
     return actions
 
@@ -221,7 +231,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -233,7 +243,8 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 
 def read_policy(text: str, model: dict) -> np.ndarray:
     """π (S,) int from `s0=a2 s1=a1`; -1 for a state that is not named."""
-    chosen = dict(item.rpartition("=")[::2] for item in text.split())  # {state: action}, without =
+    # {state: action}, the parts before and after the last =
+    chosen = dict(item.rpartition("=")[::2] for item in text.split())
     if unknown := chosen.items() - {(s, a) for s in model for a in model[s]}:
         raise SystemExit(f"error: {unknown} names no state and action of this model")
     return np.array([list(model[s]).index(chosen[s]) if s in chosen else -1 for s in model])
@@ -252,7 +263,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
-    """A row of the lecture's table of Q_i(s, a) (A, S), worked out from V_i (S,)."""
+    """A row of the lecture's table of Q(s, a) (A, S), worked out from V (S,)."""
     texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
     pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
     return [f"{worked(t, discount, texts)} = {round(q, 2):.9g}" for t, q in pairs]
@@ -260,8 +271,8 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
-    never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
+    instead, and for states where π never comes V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -287,8 +298,8 @@ def main(args: Args) -> None:
     text = args.initial_policy or ("" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1")  # π2
     policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
     if args.discount == 1 and not text:
-        # Easy to get wrong: at discount 1 the first policy needs a value. Idle actions are the best
-        # here, Q = 0. All others tie at -1, and proper_policy takes the way that soonest ends.
+        # Easy to get wrong: at discount 1 the first policy needs a value, so it ends or is idle. It
+        # comes from a made-up Q, of which only the ties count: 0 of idle actions, -1 of all others.
         tie = np.where(np.isfinite(R), -1, R)  # (A, S), -∞ where there is no action
         policy = proper_policy(P, R, Q=np.where(idle_actions(P, R), 0, tie))
     if policy.min() < 0:

@@ -21,10 +21,11 @@ Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
     At discount 1, of actions that tie, the policy takes one that ends: an argmax may walk to and
     fro for ever. Values that differ by less than 1e-9 tie, rewards below 1e-9 count as none.
-    At discount 1 V_i may stop above V*: where +8 now costs 9 at the end, and the agent may stay for
-    nothing in between, V_1 = 8 is never seen to be too much. That is an error.
-    A transition that terminates adds no V(s'), so a model needs no terminal state. If it has one,
-    as FrozenLake its goal, its own V is not used.
+    At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
+    only way out costs 9, and another action stays in s0 for 0: V_1(s0) = 8, and to stay keeps it at
+    8, where V* is 0. The script then exits with an error.
+    A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
+    its goal; their V is never read.
 """
 
 import json
@@ -56,8 +57,8 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1); the
-    error of V may be γ / (1 - γ) times as large"""
+    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1). Its
+    error may be larger: γ / (1 - γ) times the change, if γ < 1"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -114,25 +115,26 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions that tie, π takes one that ends, and soon, or
-    rests for nothing.
+    """At discount 1: π (S,) int. Of the best actions, which tie, π takes one that leads to an end
+    soon: the end of the episode, or states where it can stay for ever and V is 0.
 
-    Exits if a state has a value, and none of its best actions ever leads to an end.
+    Exits if the best actions of a state with another V never lead to an end.
     """
     V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S)
-    # The largest set of states worth 0 in which the agent can stay for ever: at first all, then
-    # those from which one of the best actions leads to states of the set alone.
+    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
+    # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
+    # those with a best action that leads into the set for certain, or ends (its row of P is empty).
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        rests = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
-        rest, before = rest & rests.any(axis=0), rest
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
+        rest, before = rest & to_rest.any(axis=0), rest
     # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # by value iteration again: of the tied actions alone, an end or a rest is worth 1, γ = 0.995.
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S) its chance; .7 + .2 + .1 < 1
+    # which has the best actions alone, and whose one reward is 1 for an end, discounted to be soon:
+    # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # until no digit of a float64 changes
-        Q_end = 0.995 * np.where(rests, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
+    while not np.array_equal(V_end, V_old):  # V_end rises until a step is below a float's precision
+        Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
         raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
@@ -175,7 +177,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # nothing comes after an end; "false", a text, is an error
+                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -198,7 +200,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
-    """A row of the lecture's table of Q_i(s, a) (A, S), worked out from V_i (S,)."""
+    """A row of the lecture's table of Q(s, a) (A, S), worked out from V (S,)."""
     texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
     pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
     return [f"{worked(t, discount, texts)} = {round(q, 2):.9g}" for t, q in pairs]
@@ -206,8 +208,8 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
-    largest |max_a Q(s, a) - V(s)|, or |Q(s, π(s)) - V(s)| where π is given. States where a policy
-    never comes have V NaN and π -1."""
+    largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
+    instead, and for states where π never comes V NaN and π -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -232,7 +234,8 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
     grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
     if ways := grids.get(type(env).__name__):
-        acts = P.sum(axis=0) > 0  # (S,) the agent comes here and goes on: no hole, goal or cliff
+        # Where the agent acts: P has no way into a hole or the goal, which end, or onto the cliff.
+        acts = P.sum(axis=0) > 0  # (S,)
         cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # CliffWalking: 12
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
         figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
@@ -254,7 +257,7 @@ def main(args: Args) -> None:
     policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
-        for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V
+        for _ in range(min(len(changes) + 1, 9)):  # Q_i comes from V_i-1, V_i from Q_i
             Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))
             Vs.append(Q_i.max(axis=0))  # (S,)
