@@ -26,8 +26,7 @@ Run it
 Measured, on two cores of an AMD EPYC, mean score of the final test, one seed
     Breakout, --environment-train-frames-max 560000 --agent-update-frequency 4
     --agent-epsilon-greedy-epsilon-final 0.02 --agent-epsilon-greedy-annealing 250000
-    --agent-replay-buffer-initial 20000: 41.71 after 54 minutes (the lecture's, with a slower fall
-    of ε, after ten million frames: 32.154)
+    --agent-replay-buffer-initial 20000: 41.71 after 54 minutes (the lecture's run: 32.154)
 
 Deviations
     lecture or [8]                        this file                           why
@@ -344,8 +343,7 @@ class ReplayMemory:
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        # bytearray: of bytes, which cannot be written to, PyTorch makes a tensor with a warning.
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
     def state_dict(self) -> dict:
@@ -464,8 +462,7 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
                 g = state["g"].lerp_(θ.grad, 1 - group["decay"])
                 n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
-                # (n - g² is a variance; rounding can make it negative)
-                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
+                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()  # 0: rounding
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 
@@ -477,13 +474,12 @@ def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
 
 
 def choose_precision(args: Args) -> str:
-    """Time 30 updates in float32 and in bfloat16: the quicker by a tenth, else float32."""
+    """Time 30 updates of zeros in float32 and bfloat16: the quicker by a tenth, else float32."""
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     q_network = QNetwork(*shape, num_actions=6).to(args.device, memory_format=torch.channels_last)
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
-    # a.float() and a.bool() are r and terminal: all of the minibatch is 0.
     inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
     def seconds(precision: str) -> float:

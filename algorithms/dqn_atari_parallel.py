@@ -358,8 +358,7 @@ class ReplayShare:
 
     def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
         """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        # bytearray: of bytes, which cannot be written to, PyTorch makes a tensor with a warning.
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])
+        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
         return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
 
 
