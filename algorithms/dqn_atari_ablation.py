@@ -527,7 +527,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    # Seeds: [seed, 0] is training's, [seed, 1] the test's, then the evaluations'.
+    # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)

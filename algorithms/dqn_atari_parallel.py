@@ -7,8 +7,9 @@
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the lock
-on a run, checksums, the choice of the precision, RMSProp, the count of dead units and the speeds in
-test.json. To --optimizer-learning-rate the flags are Table 3's, from --env-id on this script's own.
+on a run, checksums, RMSProp, --threads, the choice of the precision, the count of dead units, and
+of test.json all but the table's figures and the scores. The flags up to --optimizer-learning-rate
+are Table 3's; from --env-id on they are this script's own.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
     network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
@@ -38,8 +39,8 @@ Deviations, beside those of dqn_atari.py
                                           from its part of 𝒟
     Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam has no scale
     A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
-    acts until that holds the initial number, then learns on; its random numbers start anew. On
-    several machines all need runs/.
+    acts until that holds the initial number (these frames count), then learns on; its random
+    numbers start anew. On several machines all need runs/.
 """
 
 import copy
@@ -445,7 +446,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 
 def passed(count: int, step: int, interval: int) -> bool:
-    """Whether there is a multiple of `interval` among the last `step` numbers up to `count`."""
+    """Whether `count`, which has gone up by `step`, has come to a multiple of `interval`, or past
+    one."""
     return count // interval > (count - step) // interval
 
 
@@ -460,7 +462,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     unfinished one.
     """
     games = args.environment_evaluation_episodes if number else math.inf
-    # Seeds: [seed, 0] is training's, [seed, 1] the test's, then the evaluations'.
+    # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -594,13 +596,15 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
 
         # 9-12  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
         epsilon = epsilon_at(counters.frames - step, args)
+        # sum(s, ()): the N tuples of 4 frames become one of 4 N
         states = replay.decode(sum(s, ())).unflatten(0, (len(s), -1))  # (N, 4, 84, 84)
         a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
         envs.step_async(a)
 
         # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while an update is due for the
         # frames so far. Before lines 13-17, unlike in Algorithm 6: the simulators step meanwhile.
-        due += step if replay.added * ranks >= args.agent_replay_buffer_initial else 0  # frames
+        if replay.added * ranks >= args.agent_replay_buffer_initial:
+            due += step  # frames for which no update has been made
         while due >= args.agent_update_frequency:
             due -= args.agent_update_frequency
             batch_size = args.optimizer_minibatch_size // ranks
@@ -624,7 +628,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
             s[i] = (lz4.block.compress(x[i]),) * len(s_next) if ended[i] else s_next
 
-        # The processes agree on the number of episodes, and whether one of them is to stop.
+        # The processes agree on the number of episodes, and whether one of them is to stop: then
+        # all leave the loop together.
         sums = torch.tensor([ended.sum(), len(stop)])
         if ranks > 1:
             distributed.all_reduce(sums)
@@ -633,6 +638,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         if rank > 0:
             continue  # the rest is number 0's
 
+        # Of the simulators whose game, not only a life, is over.
         games = info.get("final_info", {})
         for i in np.flatnonzero(games.get("_episode", ())):
             score, length = games["episode"]["r"][i], games["episode"]["l"][i]
@@ -640,8 +646,9 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             writer.add_scalar("charts/episodic_length", length, counters.frames)
             bar.set_postfix_str(f"score {score:g}, ε {epsilon:.2f}", refresh=False)
 
-        # 27-29  Evaluate the agent.
-        if passed(counters.episodes, episodes, args.environment_evaluation_interval_episodes):
+        # 27-29  Evaluate the agent; not if it is to stop, for torchrun kills it after 30 seconds.
+        interval = args.environment_evaluation_interval_episodes
+        if passed(counters.episodes, episodes, interval) and not stops:
             finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
             write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))
@@ -653,8 +660,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         counters.seconds = time.monotonic() - started
         if passed(counters.frames, step, REPORT_INTERVAL):
             writer.add_scalar("charts/SPS", bar.format_dict["rate"] or 0, counters.frames)
-            writer.add_scalar("charts/epsilon", epsilon, counters.frames)
-            writer.add_scalar("losses/td_loss", loss, counters.frames)
+            writer.add_scalar("losses/td_loss", loss, counters.frames)  # of number 0's share of ℬ
             writer.add_scalar("losses/q_values", q.mean(), counters.frames)
         late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes
         interval = args.environment_checkpoint_interval_episodes
@@ -666,20 +672,21 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     bar.close()
     if rank == 0:
         save()
-    if ranks > 1:
-        distributed.barrier()  # not before number 0 has saved: now the others may end
-        distributed.destroy_process_group()
-    if stops:
-        if rank == 0:
-            print(f"frame {counters.frames:,}; go on with --resume {run_dir}")
-        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])  # or: another process was to stop
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
-    if rank == 0:
+    if rank == 0 and not (stops or stop):
         finished, _ = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
         write_text(run_dir / "test.json", json.dumps(test, indent=2))
+    if ranks > 1:
+        # The others wait for number 0: when one ends with an error, torchrun kills all.
+        distributed.barrier()
+        distributed.destroy_process_group()
+    if stops or stop:
+        if rank == 0:
+            print(f"frame {counters.frames:,}; go on with --resume {run_dir}")
+        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])  # or: another process was to stop
 
 
 def main(args: Args) -> None:
@@ -694,11 +701,10 @@ def main(args: Args) -> None:
     if ranks > 1:  # gloo on CPUs, NCCL on GPUs; the others wait while number 0 evaluates
         distributed.init_process_group(timeout=datetime.timedelta(days=1))
 
-    # [seed, number] are the seeds of the evaluations.
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
-    # Not "fork": the copy of a process whose threads hold locks can hang. A server without threads,
-    # which has imported these modules, forks instead.
+    # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead,
+    # which has imported the slow modules once for all simulators.
     multiprocessing.set_forkserver_preload(["torch.utils.tensorboard", "gymnasium", "tyro"])
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)

@@ -53,8 +53,8 @@ class Args:
     max_policies: int = 10_000
     """refuse an MDP that has more policies"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1). Its
-    error may be larger: γ / (1 - γ) times the change, if γ < 1"""
+    """V has converged when no V(s) changes by more than this in a sweep (relative to |V(s)|, if
+    above 1); the error of V may be larger, γ / (1 - γ) times: 99 times at γ = 0.99"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -232,10 +232,12 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1."""
+    instead, and for states where π never comes V NaN and π -1 (five scripts share this function).
+    """
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
+        # strict=False: without the -∞ of the actions that a state does not have
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,

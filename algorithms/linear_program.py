@@ -16,8 +16,8 @@ Measured
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
-    At discount 1, of actions that tie, the policy takes one that ends: an argmax may walk to and
-    fro for ever. Values that differ by less than 1e-9 tie, rewards below 1e-9 count as none.
+    At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
+    to and fro for ever.
 """
 
 import json
@@ -110,25 +110,26 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions, which tie, π takes one that leads to an end
-    soon: the end of the episode, or states where it can stay for ever and V is 0.
+    """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
+    that soon leads to an end, or to rest: where V is 0 and it can stay, nothing more is to be had.
 
-    Exits if the best actions of a state with another V never lead to an end.
+    Exits if the best actions of a state with V ≠ 0 lead to neither.
     """
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
     # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
-    # those with a best action that leads into the set for certain, or ends (its row of P is empty).
+    # those with a best action that has no chance to leave the set (nor has one that ends).
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # which has the best actions alone, and whose one reward is 1 for an end, discounted to be soon:
+    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
+    # tie. So value iteration goes on with a second MDP: the best actions alone, a reward of 1 for
+    # an end, and a discount below 1, so that an end is worth more the sooner it comes:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end rises until a step is below a float's precision
+    while not np.array_equal(V_end, V_old):  # no tolerance: a far end is worth little, but not 0
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
@@ -203,10 +204,12 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1."""
+    instead, and for states where π never comes V NaN and π -1 (five scripts share this function).
+    """
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
+        # strict=False: without the -∞ of the actions that a state does not have
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,

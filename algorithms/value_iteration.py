@@ -19,11 +19,11 @@ Measured
 
 Deviations
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
-    At discount 1, of actions that tie, the policy takes one that ends: an argmax may walk to and
-    fro for ever. Values that differ by less than 1e-9 tie, rewards below 1e-9 count as none.
+    At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
+    to and fro for ever.
     At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
-    only way out costs 9, and another action stays in s0 for 0: V_1(s0) = 8, and to stay keeps it at
-    8, where V* is 0. The script then exits with an error.
+    only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8; from then on to stay is worth
+    8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. The script exits with an error.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -57,8 +57,8 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
-    """V has converged when no V(s) changes by more in a sweep (relative to |V(s)|, if above 1). Its
-    error may be larger: γ / (1 - γ) times the change, if γ < 1"""
+    """V has converged when no V(s) changes by more than this in a sweep (relative to |V(s)|, if
+    above 1); the error of V may be larger, γ / (1 - γ) times: 99 times at γ = 0.99"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -102,7 +102,7 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
     """Algorithm 3: V* (S,), and the largest change of a V(s) in each sweep, relative to |V(s)| if
     that is above 1.
 
-    Exits if V has not converged after max_iterations: V* is infinite, or that is too few.
+    Exits if V has not converged after max_iterations: V* is infinite, or they are too few.
     """
     V, changes = np.zeros(R.shape[1]), []  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
@@ -115,25 +115,26 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int. Of the best actions, which tie, π takes one that leads to an end
-    soon: the end of the episode, or states where it can stay for ever and V is 0.
+    """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
+    that soon leads to an end, or to rest: where V is 0 and it can stay, nothing more is to be had.
 
-    Exits if the best actions of a state with another V never lead to an end.
+    Exits if the best actions of a state with V ≠ 0 lead to neither.
     """
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
     # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
-    # those with a best action that leads into the set for certain, or ends (its row of P is empty).
+    # those with a best action that has no chance to leave the set (nor has one that ends).
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Easy to get wrong: walking to and fro ties with walking to the goal. So a second MDP decides,
-    # which has the best actions alone, and whose one reward is 1 for an end, discounted to be soon:
+    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
+    # tie. So value iteration goes on with a second MDP: the best actions alone, a reward of 1 for
+    # an end, and a discount below 1, so that an end is worth more the sooner it comes:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end rises until a step is below a float's precision
+    while not np.array_equal(V_end, V_old):  # no tolerance: a far end is worth little, but not 0
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
@@ -209,10 +210,12 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1."""
+    instead, and for states where π never comes V NaN and π -1 (five scripts share this function).
+    """
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
+        # strict=False: without the -∞ of the actions that a state does not have
         "action_values": {s: dict(zip(model[s], q[i], strict=False)) for i, s in enumerate(model)},
         "policy": {s: list(model[s])[a] for s, a in zip(model, policy, strict=True) if a >= 0},
         "iterations": iterations,
@@ -234,7 +237,7 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
     grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
     if ways := grids.get(type(env).__name__):
-        # Where the agent acts: P has no way into a hole or the goal, which end, or onto the cliff.
+        # The cells that a transition enters and does not end in: no hole, goal or cliff.
         acts = P.sum(axis=0) > 0  # (S,)
         cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # CliffWalking: 12
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
@@ -257,7 +260,8 @@ def main(args: Args) -> None:
     policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
-        for _ in range(min(len(changes) + 1, 9)):  # Q_i comes from V_i-1, V_i from Q_i
+        # Numbered as in the lecture's tables: Q_i comes from V_i-1, V_i from Q_i.
+        for _ in range(min(len(changes) + 1, 9)):  # at most 9 rows
             Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))
             Vs.append(Q_i.max(axis=0))  # (S,)
