@@ -109,13 +109,13 @@ class Args:
     optimizer_minibatch_size: int = 32
     """transitions in a minibatch"""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
-    """frames between copies of θ to the target network [8: 10,000 updates = 40,000 frames]"""
+    """frames between copies of θ to θ⁻ [8: 10,000 updates = 40,000 frames]"""
     optimizer_learning_rate: float = 0.0001
     """learning rate [8: 0.00025]"""
 
     # This script's own
     initialization: Literal["default", "he", "orthogonal"] = "orthogonal"
-    """weights of the convolutions; everything else stays PyTorch's default [Table 4]"""
+    """weights of the convolutions; all else is PyTorch's default [Table 4]"""
     target_network: bool = True
     """whether y is computed with θ⁻, a copy, or with θ itself [Table 6]"""
     replay_buffer: bool = True
@@ -125,7 +125,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test [§7.3.3]; an evaluation stops after as many at the latest"""
+    """frames of the final test, and at most of an evaluation [§7.3.3]"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
