@@ -26,8 +26,8 @@ Run it
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
 Measured, on two cores of an AMD EPYC, bfloat16, one update in four
-    168 frames a second with 8 simulators, where dqn_atari.py makes 190: 84 % of a frame is learning,
-    and the simulators take the cores from it
+    168 frames a second with 8 simulators, where dqn_atari.py makes 190: 84 % of a frame is
+    learning, and the simulators take the cores from it
 
 Deviations, beside those of dqn_atari.py
     Algorithm 6                           this file                           why
