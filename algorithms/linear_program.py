@@ -105,31 +105,33 @@ def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
     """Q (A, S) of the values V (S,)."""
     # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
-    Q = (P @ (discount * V)).reshape(R.shape)  # (A, S)
-    return np.add(R, Q, out=Q)  # R + Q without a copy, which at 10^6 states is a third of the time
+    future = (P @ (discount * V)).reshape(R.shape)  # (A, S) γ Σ_s' P(s'|s, a) V(s')
+    return np.add(R, future, out=future)  # R + future, in place: a new array takes time
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
-    that soon leads to an end, or to rest: where V is 0 and it can stay, nothing more is to be had.
+    that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
+    and V is 0).
 
-    Exits if the best actions of a state with V ≠ 0 lead to neither.
+    Exits if the best actions of a state with V ≠ 0 lead to no end.
     """
+    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
+    # tie, and an argmax may walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
-    # those with a best action that has no chance to leave the set (nor has one that ends).
+    # Rest: the largest set of states with V = 0 that the agent need not leave. At first it has all
+    # of them; then those go from which every best action may lead out of it.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S) no chance to come elsewhere
         rest, before = rest & to_rest.any(axis=0), rest
-    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
-    # tie. So value iteration goes on with a second MDP: the best actions alone, a reward of 1 for
-    # an end, and a discount below 1, so that an end is worth more the sooner it comes:
+    # To be soon there is a second MDP, and value iteration solves it. It has the best actions alone
+    # and a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # no tolerance: a far end is worth little, but not 0
+    while not np.array_equal(V_end, V_old):  # V_end only rises, and so comes to a standstill
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
@@ -184,7 +186,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
+                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

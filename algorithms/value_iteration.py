@@ -22,8 +22,9 @@ Deviations
     At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
     to and fro for ever.
     At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
-    only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8; from then on to stay is worth
-    8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. The script exits with an error.
+    only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8, since V_0(s1) = 0. From then
+    on to stay is worth 8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. Then the script exits
+    with an error.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -58,7 +59,7 @@ class Args:
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
     """V has converged when no V(s) changes by more than this in a sweep (relative to |V(s)|, if
-    above 1); the error of V may be larger, γ / (1 - γ) times: 99 times at γ = 0.99"""
+    above 1); the error of V may be larger"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
@@ -94,15 +95,15 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
     """Q (A, S) of the values V (S,)."""
     # Q(s, a) = Σ_s' P(s'|s, a) [R(s, a, s') + γ V(s')]  Equation 29; R is summed already
-    Q = (P @ (discount * V)).reshape(R.shape)  # (A, S)
-    return np.add(R, Q, out=Q)  # R + Q without a copy, which at 10^6 states is a third of the time
+    future = (P @ (discount * V)).reshape(R.shape)  # (A, S) γ Σ_s' P(s'|s, a) V(s')
+    return np.add(R, future, out=future)  # R + future, in place: a new array takes time
 
 
 def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_000):
     """Algorithm 3: V* (S,), and the largest change of a V(s) in each sweep, relative to |V(s)| if
     that is above 1.
 
-    Exits if V has not converged after max_iterations: V* is infinite, or they are too few.
+    Exits if V has not converged after max_iterations: V* is infinite, or the sweeps are too few.
     """
     V, changes = np.zeros(R.shape[1]), []  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
@@ -116,25 +117,27 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
-    that soon leads to an end, or to rest: where V is 0 and it can stay, nothing more is to be had.
+    that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
+    and V is 0).
 
-    Exits if the best actions of a state with V ≠ 0 lead to neither.
+    Exits if the best actions of a state with V ≠ 0 lead to no end.
     """
+    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
+    # tie, and an argmax may walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # The largest set of states with V = 0 that the agent need not leave: at first all of them, then
-    # those with a best action that has no chance to leave the set (nor has one that ends).
+    # Rest: the largest set of states with V = 0 that the agent need not leave. At first it has all
+    # of them; then those go from which every best action may lead out of it.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S)
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S) no chance to come elsewhere
         rest, before = rest & to_rest.any(axis=0), rest
-    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
-    # tie. So value iteration goes on with a second MDP: the best actions alone, a reward of 1 for
-    # an end, and a discount below 1, so that an end is worth more the sooner it comes:
+    # To be soon there is a second MDP, and value iteration solves it. It has the best actions alone
+    # and a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # no tolerance: a far end is worth little, but not 0
+    while not np.array_equal(V_end, V_old):  # V_end only rises, and so comes to a standstill
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if (np.abs(V[V_end == 0]) > 1e-9).any():
@@ -178,7 +181,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # not "if not terminated": here the text "false" is an error
+                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -237,7 +240,8 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
     grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
     if ways := grids.get(type(env).__name__):
-        # The cells that a transition enters and does not end in: no hole, goal or cliff.
+        # P has no transitions that end: the columns of the holes and the goal are empty. So is the
+        # cliff's, from where the agent is put back to the start.
         acts = P.sum(axis=0) > 0  # (S,)
         cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # CliffWalking: 12
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
@@ -261,7 +265,7 @@ def main(args: Args) -> None:
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
         # Numbered as in the lecture's tables: Q_i comes from V_i-1, V_i from Q_i.
-        for _ in range(min(len(changes) + 1, 9)):  # at most 9 rows
+        for _ in range(min(len(changes) + 1, 9)):  # Q converges a sweep after V
             Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))
             Vs.append(Q_i.max(axis=0))  # (S,)
