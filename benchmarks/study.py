@@ -188,6 +188,8 @@ def study(options: argparse.Namespace, flags: list[str]) -> None:
         for seed in range(first, first + options.seeds)
         for arm in STUDIES[options.command]
     ]
+    if options.only not in (None, *range(1, len(runs) + 1)):
+        raise SystemExit(f"error: --only is from 1 to {len(runs)}")
     failed = False
     for number, run_flags in enumerate(runs, 1):
         if options.list:
