@@ -180,7 +180,8 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             model = (env := gym.make(args.env_id, **kwargs).unwrapped).P
-        # Names are text, as in JSON. A state without an action is terminal.
+        # Names are text, as in JSON. A state without an action is terminal, and is left out:
+        # transitions into it terminate, which `arrays` checks.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         return model, env, *arrays(model)
     except Exception as error:  # no such file, environment or argument, or it has no model
@@ -234,8 +235,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1 (five scripts share this function).
-    """
+    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),

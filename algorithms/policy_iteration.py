@@ -162,7 +162,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
     and V is 0).
 
-    Exits if the best actions of a state with V ≠ 0 lead to no end.
+    Exits if the best actions of a state lead to no end.
     """
     # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
     # tie, and an argmax may walk to and fro for ever.
@@ -172,17 +172,18 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # of them; then those go from which every best action may lead out of it.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)  # (A, S) no chance to come elsewhere
+        # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
+        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
     # To be soon there is a second MDP, and value iteration solves it. It has the best actions alone
     # and a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end only rises, and so comes to a standstill
+    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it comes to rest
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
-    if (np.abs(V[V_end == 0]) > 1e-9).any():
+    if not V_end.all():
         raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
     return Q_end.argmax(axis=0)  # (S,)
 
@@ -214,7 +215,8 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
             model = (env := gym.make(args.env_id, **kwargs).unwrapped).P
-        # Names are text, as in JSON. A state without an action is terminal.
+        # Names are text, as in JSON. A state without an action is terminal, and is left out:
+        # transitions into it terminate, which `arrays` checks.
         model = {str(s): {str(a): t for a, t in model[s].items()} for s in model if model[s]}
         return model, env, *arrays(model)
     except Exception as error:  # no such file, environment or argument, or it has no model
@@ -275,8 +277,7 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1 (five scripts share this function).
-    """
+    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
