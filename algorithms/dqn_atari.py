@@ -462,7 +462,7 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
                 g = state["g"].lerp_(θ.grad, 1 - group["decay"])
                 n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
-                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()  # 0: rounding
+                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()  # rounded: ≥ 0
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 

@@ -582,7 +582,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
         content["counters"] = vars(counters)
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    stop = []  # signals: the loop ends with the step, or the evaluation, that it is at
+    stop = []  # signals so far: with one, the loop ends after the step, or the evaluation
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, disable=rank > 0)

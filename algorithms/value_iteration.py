@@ -133,8 +133,8 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
         # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # To be soon there is a second MDP, and value iteration solves it. It has the best actions alone
-    # and a reward of 1 for an end, and any discount below 1 makes a later end worth less:
+    # What is soon, a second MDP tells, solved by value iteration. It has the best actions alone and
+    # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
