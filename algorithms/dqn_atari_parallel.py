@@ -647,9 +647,8 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
             writer.add_scalar("charts/episodic_length", length, counters.frames)
             bar.set_postfix_str(f"score {score:g}, ε {epsilon:.2f}", refresh=False)
 
-        # 27-29  Evaluate the agent; not if it is to stop, for torchrun kills it after 30 seconds.
-        interval = args.environment_evaluation_interval_episodes
-        if passed(counters.episodes, episodes, interval) and not stops:
+        # 27-29  Evaluate the agent.
+        if passed(counters.episodes, episodes, args.environment_evaluation_interval_episodes):
             finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
             write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))

@@ -248,7 +248,7 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     wait_until(lambda: read_checkpoint(run_dir)["counters"]["updates"])
     run.process.terminate()
     code, output, _ = run.end()
-    assert code == 128 + signal.SIGTERM
+    assert code == 128 + signal.SIGTERM and not (run_dir / "test.json").exists()
     saved = read_checkpoint(run_dir)
     frames, updates = saved["counters"]["frames"], saved["counters"]["updates"]
     monkeypatch.chdir(tmp_path)
