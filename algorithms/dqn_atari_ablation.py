@@ -1,8 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
-#     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
+#     "ale-py>=0.12", "filelock", "gymnasium>=1.1", "lz4", "numpy>=1.26",
+#     "opencv-python-headless", "pandas>=2.2", "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
 r"""Deep Q-Learning on Atari games, taken apart (ECE 544NA, Lecture 27, §7.5, Tables 4 and 6):
@@ -38,7 +38,7 @@ import sys
 import time
 import timeit
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -48,6 +48,7 @@ import filelock
 import gymnasium as gym
 import lz4.block
 import numpy as np
+import pandas as pd
 import torch
 import tyro
 from gymnasium.wrappers import ClipReward, RecordEpisodeStatistics, TransformObservation
@@ -308,9 +309,9 @@ class ReplayMemory:
     a clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
     Each is whole in itself, so none can mix two episodes."""
 
-    def __init__(self, capacity: int, shape: tuple[int, int], device: str):
+    def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
-        self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
+        self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
 
     def __len__(self) -> int:
@@ -327,15 +328,18 @@ class ReplayMemory:
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
         """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
         s' like s, terminal (B,) bool, on the device."""
-        frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
-        frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
+        s = self.decode(self.frames[indices, :-1])  # (B, 4, 84, 84)
+        s_next = self.decode(self.frames[indices, 1:])  # (B, 4, 84, 84)
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
-        return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
+        return s, a.long(), r, s_next, terminal.bool()
 
-    def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
-        """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
-        return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
+    def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
+        """B histories of LZ4 frames to states (B, 4, 84, 84) uint8 on the device. In memory the 4
+        values of a pixel lie side by side, as the convolutions read them (channels_last)."""
+        planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
+        pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
+        pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
+        return torch.from_numpy(pixels).to(self.device).permute(0, 3, 1, 2)
 
     def state_dict(self) -> dict:
         """For a checkpoint: every frame once, and per transition the places of its frames. Two
@@ -358,7 +362,7 @@ class ReplayMemory:
         unique = [bytes(joined[i:j]) for i, j in zip([0, *ends[:-1]], ends, strict=True)]
         self.added = saved["added"]
         for i, places in enumerate(saved["places"].tolist()):
-            self.frames[i] = tuple(unique[place] for place in places)
+            self.frames[i] = [unique[place] for place in places]
         self.numbers[: len(self)] = saved["numbers"].numpy()
 
 
@@ -409,10 +413,10 @@ def epsilon_at(frame: int, args: Args) -> float:
 @torch.inference_mode()
 def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
     """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
-    is (4, 84, 84) uint8."""
+    is (1, 4, 84, 84) uint8."""
     if rng.random() < epsilon:
         return int(rng.integers(q_network.head.out_features))
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
+    return q_network(state).argmax(dim=1).item()
 
 
 def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
@@ -474,6 +478,7 @@ def choose_precision(args: Args) -> str:
     q_network = QNetwork(*shape, num_actions=6).to(args.device, memory_format=torch.channels_last)
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
+    s = s.to(memory_format=torch.channels_last)  # as gather gives it
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
     inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
@@ -508,9 +513,9 @@ def held_out_states(args: Args, decode: Callable) -> torch.Tensor:
             state, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
                 state, _ = env.reset()
-        states.append(decode(state))  # (4, 84, 84)
+        states.append(state)
     env.close()
-    return torch.stack(states)
+    return decode(states)
 
 
 @torch.no_grad()
@@ -519,12 +524,11 @@ def max_q_mean(q_network: QNetwork, states: torch.Tensor) -> float:
     return q_network(states).amax(dim=1).mean().item()
 
 
-def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
     """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
 
     Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
-    and the random actions. Returns [(score, length in frames) of every finished game], and of the
-    unfinished one.
+    and the random actions. Returns (score, length in frames) of every game that was finished.
     """
     games = args.environment_evaluation_episodes if number else math.inf
     # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
@@ -534,16 +538,14 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     finished = []
     epsilon = args.agent_epsilon_greedy_epsilon_evaluation
     for _ in tqdm(range(args.environment_test_frames), "evaluation", leave=False, mininterval=1):
-        action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
+        action = epsilon_greedy(q_network, decode([state]), epsilon, exploration_rng)
         state, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             finished.append((float(info["episode"]["r"]), info["episode"]["l"]))
             state, _ = env.reset()
         if len(finished) == games:
             break
-    # what RecordEpisodeStatistics has counted so far
-    unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
-    return finished, unfinished
+    return finished
 
 
 # ---- report and checkpoint -----------------------------------------------------------------------
@@ -572,14 +574,13 @@ def summary(counters, finished: list[tuple[float, int]]) -> dict:
     return row | {"seconds": round(counters.seconds, 1)}
 
 
-def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple) -> None:
+def write_test(path: Path, counters: Counters, finished: list) -> None:
     """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
     and how fast the first and the last tenth of the learning frames were."""
     evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
     tenth = math.ceil(len(counters.speeds) / 10)  # a run that slows down shows here
     result = summary(counters, finished) | {
         "last_evaluations_score_mean": float(np.mean(evaluations)),
-        "unfinished_score_and_length": unfinished,
         "frames_per_second_first_tenth": float(np.median(counters.speeds[:tenth] or [math.nan])),
         "frames_per_second_last_tenth": float(np.median(counters.speeds[-tenth:] or [math.nan])),
         "scores": [score for score, _ in finished],
@@ -587,12 +588,6 @@ def write_test(path: Path, counters: Counters, finished: list, unfinished: tuple
     }
     print("\n".join(f"{name:32}{value}" for name, value in result.items()))
     write_text(path, json.dumps(result, indent=2))
-
-
-def as_csv(rows: list[dict]) -> str:
-    """Rows under one header."""
-    lines = [rows[0].keys(), *(row.values() for row in rows)]
-    return "".join(",".join(map(str, line)) + "\n" for line in lines)
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -685,11 +680,11 @@ def main(args: Args) -> None:
     if args.precision == "auto":
         args.precision = choose_precision(args)
     # 2  Initialize 𝒟.
-    shape = (args.environment_state_height, args.environment_state_width)
+    shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     replay = ReplayMemory(args.agent_replay_buffer_maximum_length, shape, args.device)
     # 3  Initialize θ.
     torch.manual_seed(args.seed)
-    q_network = QNetwork(args.agent_history_length, *shape, len(actions))
+    q_network = QNetwork(*shape, len(actions))
     initialize(q_network, args.initialization)
     q_network.to(args.device, memory_format=torch.channels_last)  # quicker convolutions
     optimizer = make_optimizer(args, q_network)
@@ -747,7 +742,7 @@ def main(args: Args) -> None:
 
         # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q(s, a; θ). Add (s, a, r, s') to 𝒟.
         epsilon = epsilon_at(counters.frames - 1, args)
-        a = epsilon_greedy(q_network, replay.decode(s), epsilon, exploration_rng)
+        a = epsilon_greedy(q_network, replay.decode([s]), epsilon, exploration_rng)
         s_next, r, terminated, truncated, info = env.step(a)
         replay.add(s, a, r, s_next, terminated)
 
@@ -778,11 +773,12 @@ def main(args: Args) -> None:
 
         # 27-29  Evaluate the agent.
         if episode_ended and counters.episodes % args.environment_evaluation_interval_episodes == 0:
-            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            finished = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             row = summary(counters, finished)
             row["held_out_max_q_mean"] = max_q_mean(q_network, held_out)
             counters.evaluations.append(row)
-            write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))
+            table = pd.DataFrame(counters.evaluations).set_index("frames")
+            write_file(run_dir / "evaluations.csv", table.to_csv)
             mean = counters.evaluations[-1]["score_mean"]
             writer.add_scalar("evaluation/score_mean", mean, counters.frames)
             held_out_max_q = row["held_out_max_q_mean"]
@@ -817,8 +813,8 @@ def main(args: Args) -> None:
         raise SystemExit(128 + stop[0])  # the shell's code for a signal
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
-    finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
-    write_test(run_dir / "test.json", counters, finished, unfinished)
+    finished = evaluate(args, q_network, replay.decode, number=0)
+    write_test(run_dir / "test.json", counters, finished)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "ale-py>=0.12", "gymnasium>=1.1", "lz4", "numpy>=1.26", "opencv-python-headless",
-#     "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
+#     "ale-py>=0.12", "gymnasium>=1.1", "lz4", "numpy>=1.26",
+#     "opencv-python-headless", "pandas>=2.2", "tensorboard", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
@@ -56,7 +56,7 @@ import signal
 import sys
 import time
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -65,6 +65,7 @@ import cv2
 import gymnasium as gym
 import lz4.block
 import numpy as np
+import pandas as pd
 import torch
 import tyro
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
@@ -334,9 +335,9 @@ class ReplayShare:
     to 5 frames, an action, a clipped reward and whether s' is terminal; arrays are made when a
     minibatch is drawn (§7.3.2). Each is whole, so none can mix two episodes or two simulators."""
 
-    def __init__(self, capacity: int, shape: tuple[int, int], device: str):
+    def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
-        self.frames = [()] * capacity  # each x_{t-3}, x_{t-2}, x_{t-1}, x_t, x_{t+1}: LZ4 bytes
+        self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
 
     def __len__(self) -> int:
@@ -353,15 +354,18 @@ class ReplayShare:
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
         """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
         s' like s, terminal (B,) bool, on the device."""
-        frames = self.decode(frame for i in indices for frame in self.frames[i])  # (5 B, 84, 84)
-        frames = frames.unflatten(0, (len(indices), -1))  # (B, 5, 84, 84)
+        s = self.decode(self.frames[indices, :-1])  # (B, 4, 84, 84)
+        s_next = self.decode(self.frames[indices, 1:])  # (B, 4, 84, 84)
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
-        return frames[:, :-1], a.long(), r, frames[:, 1:], terminal.bool()
+        return s, a.long(), r, s_next, terminal.bool()
 
-    def decode(self, frames: Iterable[bytes]) -> torch.Tensor:
-        """n LZ4 frames to (n, 84, 84) uint8 on the device."""
-        pixels = bytearray().join([lz4.block.decompress(frame) for frame in frames])  # writable
-        return torch.frombuffer(pixels, dtype=torch.uint8).view(-1, *self.shape).to(self.device)
+    def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
+        """B histories of LZ4 frames to states (B, 4, 84, 84) uint8 on the device. In memory the 4
+        values of a pixel lie side by side, as the convolutions read them (channels_last)."""
+        planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
+        pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
+        pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
+        return torch.from_numpy(pixels).to(self.device).permute(0, 3, 1, 2)
 
 
 # ---- network -------------------------------------------------------------------------------------
@@ -407,10 +411,10 @@ def epsilon_at(frame: int, args: Args) -> float:
 @torch.inference_mode()
 def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
     """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
-    is (4, 84, 84) uint8."""
+    is (1, 4, 84, 84) uint8."""
     if rng.random() < epsilon:
         return int(rng.integers(q_network.head.out_features))
-    return q_network(state.unsqueeze(0)).argmax(dim=1).item()
+    return q_network(state).argmax(dim=1).item()
 
 
 @torch.inference_mode()
@@ -455,12 +459,11 @@ def passed(count: int, step: int, interval: int) -> bool:
 # ---- evaluation ----------------------------------------------------------------------------------
 
 
-def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
     """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
 
     Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
-    and the random actions. Returns [(score, length in frames) of every finished game], and of the
-    unfinished one.
+    and the random actions. Returns (score, length in frames) of every game that was finished.
     """
     games = args.environment_evaluation_episodes if number else math.inf
     # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
@@ -470,16 +473,14 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     finished = []
     epsilon = args.agent_epsilon_greedy_epsilon_evaluation
     for _ in tqdm(range(args.environment_test_frames), "evaluation", leave=False, mininterval=1):
-        action = epsilon_greedy(q_network, decode(state), epsilon, exploration_rng)
+        action = epsilon_greedy(q_network, decode([state]), epsilon, exploration_rng)
         state, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             finished.append((float(info["episode"]["r"]), info["episode"]["l"]))
             state, _ = env.reset()
         if len(finished) == games:
             break
-    # what RecordEpisodeStatistics has counted so far
-    unfinished = env.get_wrapper_attr("episode_returns"), env.get_wrapper_attr("episode_lengths")
-    return finished, unfinished
+    return finished
 
 
 # ---- report and checkpoint -----------------------------------------------------------------------
@@ -494,12 +495,6 @@ def summary(counters, finished: list[tuple[float, int]]) -> dict:
         row[f"{name}_mean"] = float(np.mean(values))
         row[f"{name}_variance"] = float(np.var(values, ddof=min(1, len(values) - 1)))
     return row | {"seconds": round(counters.seconds, 1)}
-
-
-def as_csv(rows: list[dict]) -> str:
-    """Rows under one header."""
-    lines = [rows[0].keys(), *(row.values() for row in rows)]
-    return "".join(",".join(map(str, line)) + "\n" for line in lines)
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -534,11 +529,11 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     # dqn_atari.py's FrameHistory, but on this side of the pipe: N histories of LZ4 bytes
     s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]
     # 2  Initialize 𝒟.
-    shape = (args.environment_state_height, args.environment_state_width)
+    shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     replay = ReplayShare(args.agent_replay_buffer_maximum_length // ranks, shape, args.device)
     # 3  Initialize θ.
     torch.manual_seed(args.seed)
-    q_network = QNetwork(args.agent_history_length, *shape, len(actions))
+    q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
     optimizer = torch.optim.Adam(q_network.parameters(), args.optimizer_learning_rate, fused=True)
@@ -597,8 +592,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
 
         # 9-12  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
         epsilon = epsilon_at(counters.frames - step, args)
-        # sum(s, ()): the N tuples of 4 frames become one of 4 N
-        states = replay.decode(sum(s, ())).unflatten(0, (len(s), -1))  # (N, 4, 84, 84)
+        states = replay.decode(s)  # (N, 4, 84, 84)
         a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
         envs.step_async(a)
 
@@ -649,9 +643,10 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
 
         # 27-29  Evaluate the agent.
         if passed(counters.episodes, episodes, args.environment_evaluation_interval_episodes):
-            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            finished = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
-            write_text(run_dir / "evaluations.csv", as_csv(counters.evaluations))
+            table = pd.DataFrame(counters.evaluations).set_index("frames")
+            write_file(run_dir / "evaluations.csv", table.to_csv)
             mean = counters.evaluations[-1]["score_mean"]
             writer.add_scalar("evaluation/score_mean", mean, counters.frames)
             tqdm.write(f"frame {counters.frames:,}, update {counters.updates:,}: score {mean}")
@@ -675,7 +670,7 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     if rank == 0 and not (stops or stop):
-        finished, _ = evaluate(args, q_network, replay.decode, number=0)
+        finished = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
         write_text(run_dir / "test.json", json.dumps(test, indent=2))

@@ -2,7 +2,7 @@
 # requires-python = ">=3.10"
 # dependencies = [
 #     "ale-py>=0.12", "gymnasium>=1.1", "lz4", "matplotlib>=3.9", "numpy>=1.26",
-#     "opencv-python-headless", "pillow>=10.1", "torch>=2.11", "tqdm", "tyro>=0.9",
+#     "opencv-python-headless", "pandas>=2.2", "pillow>=10.1", "torch>=2.11", "tqdm", "tyro>=0.9",
 # ]
 # ///
 """Watch a trained agent play and think: the pictures of §7.4 (ECE 544NA, Lecture 27, Figures 20 to
@@ -46,6 +46,7 @@ import cv2
 import gymnasium as gym
 import lz4.block
 import numpy as np
+import pandas as pd
 import torch
 import tyro
 from gymnasium.wrappers import TransformObservation
@@ -300,12 +301,6 @@ def largest_jumps(values: np.ndarray, count: int = 3) -> list[int]:
 # ---- report: table, figures, video ---------------------------------------------------------------
 
 
-def as_csv(rows: list[dict]) -> str:
-    """Rows under one header."""
-    lines = [rows[0].keys(), *(row.values() for row in rows)]
-    return "".join(",".join(map(str, line)) + "\n" for line in lines)
-
-
 def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) -> Figure:
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
@@ -444,7 +439,7 @@ def main(args: Args) -> None:
     shown = rows[: int(args.video_seconds * FRAMES_PER_SECOND)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "trace.csv").write_text(as_csv(rows))
+        pd.DataFrame(rows).to_csv(folder / "trace.csv", index=False)
         draw_curves(rows, q, moments, trained).savefig(folder / "values.png", dpi=100)
         draw_moments(rows, screens, moments).savefig(folder / "moments.png", dpi=100)
         write_video(folder, pictures(shown, q, screens, trained))

@@ -191,7 +191,7 @@ def parts(args: Args) -> dict[str, float]:
     script_args = dqn.Args(env_id=args.env_id, device="cpu")
     rng = np.random.default_rng(0)
     env = dqn.FrameHistory(dqn.make_env(script_args, rng, training=True), 4)
-    replay = dqn.ReplayMemory(2_000, (84, 84), "cpu")
+    replay = dqn.ReplayMemory(2_000, (4, 84, 84), "cpu")
     q_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n))
     q_network.to(memory_format=torch.channels_last)
     target_network = copy.deepcopy(q_network).requires_grad_(False)
@@ -226,7 +226,7 @@ def parts(args: Args) -> dict[str, float]:
     times = {
         "emulate (the bare emulator)": emulator,
         "preprocess, compress, store": frame - emulator,
-        "act": milliseconds(lambda: dqn.epsilon_greedy(q_network, replay.decode(s), 0.0, rng)),
+        "act": milliseconds(lambda: dqn.epsilon_greedy(q_network, replay.decode([s]), 0.0, rng)),
         "sample": milliseconds(lambda: replay.gather(rng.integers(len(replay), size=32))),
         "update, float32": milliseconds(lambda: update("float32")),
         "update, bfloat16": milliseconds(lambda: update("bfloat16")),

@@ -41,7 +41,7 @@ def play(game: str, capacity: int, transitions: int) -> dqn.ReplayMemory:
     args = dqn.Args(env_id=f"{game}NoFrameskip-v4")
     rng = np.random.default_rng(0)
     env = dqn.FrameHistory(dqn.make_env(args, rng, training=True), args.agent_history_length)
-    replay = dqn.ReplayMemory(capacity, (84, 84), "cpu")
+    replay = dqn.ReplayMemory(capacity, (4, 84, 84), "cpu")
     s, _ = env.reset(seed=1)
     for _ in tqdm(range(transitions), desc=game, unit="frame", unit_scale=True):
         a = int(rng.integers(env.action_space.n))

@@ -82,7 +82,7 @@ def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkey
     add = ablation.ReplayMemory.add
 
     def noted(self, s, a, r, s_next, terminal):
-        stored.append((self.decode(s), a, r, self.decode(s_next), terminal))
+        stored.append((self.decode([s])[0], a, r, self.decode([s_next])[0], terminal))
         add(self, s, a, r, s_next, terminal)
         stored_when.append(len(stored))
 
@@ -118,7 +118,7 @@ def test_initialization(name):
 
 
 def test_held_out_states_are_the_seeds_own():
-    replay = ablation.ReplayMemory(1, (84, 84), "cpu")
+    replay = ablation.ReplayMemory(1, (4, 84, 84), "cpu")
     first, again, other = [
         ablation.held_out_states(ablation.Args(seed=seed), replay.decode) for seed in (1, 1, 2)
     ]

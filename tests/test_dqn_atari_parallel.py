@@ -92,9 +92,9 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
         env = serial.FrameHistory(capped(env), 4)
         state, _ = env.reset(seed=1 + i)
         for j in range(i, len(s), simulators):
-            assert torch.equal(s[j], run.memory.decode(state)), (i, j)
+            assert torch.equal(s[j], run.memory.decode([state])[0]), (i, j)
             state, reward, terminated, truncated, info = env.step(int(a[j]))
-            assert torch.equal(s_next[j], run.memory.decode(state)), (i, j)
+            assert torch.equal(s_next[j], run.memory.decode([state])[0]), (i, j)
             assert (float(r[j]), bool(terminal[j])) == (reward, terminated), (i, j)
             if terminated or truncated:
                 ends.append("cap" if truncated else "game" if "episode" in info else "life")
@@ -108,7 +108,7 @@ def test_batch_of_actions_is_greedy_for_each_state():
     q_network.head.weight.data *= 100
     states = torch.randint(256, (5, 4, 84, 84), dtype=torch.uint8)
     rng = np.random.default_rng(0)
-    wanted = [serial.epsilon_greedy(q_network, state, 0.0, rng) for state in states]
+    wanted = [serial.epsilon_greedy(q_network, state, 0.0, rng) for state in states.split(1)]
     assert parallel.epsilon_greedy_batch(q_network, states, 0.0, rng).tolist() == wanted
     many = [parallel.epsilon_greedy_batch(q_network, states, 0.6, rng) for _ in range(400)]
     greedy = np.array(many) == wanted  # (400, 5)

@@ -92,14 +92,14 @@ def plain(value):
 def everything(run_dir: Path) -> dict:
     """All that a run leaves, but its clocks."""
     saved = torch.load(run_dir / "checkpoint.pt", weights_only=True)
-    replay = dqn.ReplayMemory(SHORT["agent-replay-buffer-maximum-length"], (44, 52), "cpu")
+    replay = dqn.ReplayMemory(SHORT["agent-replay-buffer-maximum-length"], (4, 44, 52), "cpu")
     replay.load_state_dict(saved.pop("replay"))
     rows = [row.rsplit(",", 1)[0] for row in (run_dir / "evaluations.csv").read_text().splitlines()]
     test = json.loads((run_dir / "test.json").read_text())
     args = json.loads((run_dir / "args.json").read_text())
     return plain(saved) | {
-        "replay": (replay.added, replay.frames, replay.numbers.tobytes()), "rows": rows,
-        "test": {name: test[name] for name in ("scores", "unfinished_score_and_length", "updates")},
+        "replay": (replay.added, replay.frames.tolist(), replay.numbers.tobytes()), "rows": rows,
+        "test": {name: test[name] for name in ("scores", "lengths", "updates")},
         "args": {name: args[name] for name in args if name != "runs_dir"},
         "q_network.pt": plain(torch.load(run_dir / "q_network.pt", weights_only=True)["q_network"]),
     }
