@@ -161,9 +161,8 @@ def read_args() -> Args:
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
         # Once more, with the run's own flags as defaults: no other flag may differ from them.
         args = tyro.cli(Args, default=defaults)
-        shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
-        defaults.environment_train_frames_max = args.environment_train_frames_max
-        if shorter or args != defaults:
+        frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
+        if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
     # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():

@@ -165,9 +165,8 @@ def read_args() -> Args:
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
         # Once more, with the run's own flags as defaults: no other flag may differ from them.
         args = tyro.cli(Args, default=defaults)
-        shorter = args.environment_train_frames_max < defaults.environment_train_frames_max
-        defaults.environment_train_frames_max = args.environment_train_frames_max
-        if shorter or args != defaults:
+        frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
+        if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
     # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
     for name, value in vars(args).items():
@@ -517,7 +516,7 @@ def write_text(path: Path, text: str) -> None:
 # ---- main ----------------------------------------------------------------------------------------
 
 
-def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -> None:
+def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
     # For speed alone: Adam's moments of dead units fade below 1e-38, where a CPU is 10 times
     # slower. They become 0, in the threads, too, which are started after this.
@@ -541,7 +540,6 @@ def learn(args: Args, envs: AsyncVectorEnv, rngs: list, rank: int, ranks: int) -
     target_network = copy.deepcopy(q_network).requires_grad_(False)
     # 5-7  ε is a function of the frame; the rest is counted.
     counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[])
-    exploration_rng, minibatch_rng = rngs
 
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
     if args.resume:
@@ -704,7 +702,7 @@ def main(args: Args) -> None:
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)
     try:
-        learn(args, envs, rngs[:2], rank, ranks)
+        learn(args, envs, *rngs[:2], rank, ranks)
     except (EOFError, ConnectionError) as error:
         raise SystemExit(f"error: a simulator has died: {error!r}") from None
     except RuntimeError as error:
