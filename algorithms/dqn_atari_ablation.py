@@ -150,7 +150,7 @@ def read_args() -> Args:
             defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        # Once more, with the run's own flags as defaults: no other flag may differ from them.
+        # Once more, with the run's own flags as defaults: whatever differs now was asked for.
         args = tyro.cli(Args, default=defaults)
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
@@ -290,7 +290,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
-    # Gymnasium asks for the space of what comes out; None is that of before, and nobody reads it.
+    # Each also declares the space of its result, which vector environments read. None: as before.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -304,9 +304,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 
 class ReplayMemory:
-    """𝒟: the last `capacity` transitions (§5.3). A transition is references to 5 frames, an action,
-    a clipped reward and whether s' is terminal; arrays are made when a minibatch is drawn (§7.3.2).
-    Each is whole in itself, so none can mix two episodes."""
+    """𝒟: the last `capacity` transitions (§5.3): references to 5 frames (s' is s moved on by one),
+    an action, a clipped reward, whether s' is terminal. Arrays are made when a minibatch is drawn
+    (§7.3.2). As no s is cut from a long row of frames, none mixes episodes."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -333,8 +333,9 @@ class ReplayMemory:
         return s, a.long(), r, s_next, terminal.bool()
 
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
-        """B histories of LZ4 frames to states (B, 4, 84, 84) uint8 on the device. In memory the 4
-        values of a pixel lie side by side, as the convolutions read them (channels_last)."""
+        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device. In memory
+        the 4 values of a pixel lie side by side, as convolutions read them (channels_last)."""
+        # 4 planes: the k-th frames of all histories in a row. merge puts their pixels side by side.
         planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
         pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
         pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
@@ -385,7 +386,8 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
+        # `update` may have switched the layers to bfloat16 by autocast; Q stays float32.
+        with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -433,7 +435,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22 and [8], for whose RMSProp a mean would be too small; Adam divides the scale out.
+    # in line 22. Adam would do the same with a mean; the RMSProp of [8] adds 0.01 to a gradient's
+    # variance, and is meant for sums.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -444,8 +447,9 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 
 class NatureRMSprop(torch.optim.Optimizer):
-    """The RMSProp that [8] released (Figure 18). PyTorch's has the constant outside the root. What
-    Figure 18 calls the gradient momentum is 0.95, the decay of the mean gradient g, below."""
+    """The RMSProp that [8] released (Figure 18): a step is the gradient over the root of its
+    variance; g and n are running means of the gradient and its square. Both decay by 0.95, Figure
+    18's momenta; the step has none. PyTorch's has the constant outside the root."""
 
     def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
         super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
@@ -460,7 +464,8 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
                 g = state["g"].lerp_(θ.grad, 1 - group["decay"])
                 n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
-                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()  # rounded: ≥ 0
+                variance = (n - g.square()).clamp_min(0)  # rounding could make it negative
+                root = (variance + group["constant"]).sqrt()
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 
@@ -478,7 +483,7 @@ def choose_precision(args: Args) -> str:
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     s = s.to(memory_format=torch.channels_last)  # as gather gives it
-    a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,)
+    a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,); r and terminal like it
     inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
     def seconds(precision: str) -> float:
@@ -524,13 +529,12 @@ def max_q_mean(q_network: QNetwork, states: torch.Tensor) -> float:
 
 
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
-    """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
-
-    Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
-    and the random actions. Returns (score, length in frames) of every game that was finished.
-    """
+    """Play whole games at ε_evaluation, for raw reward. Evaluations number 1, 2, … are of
+    `environment_evaluation_episodes` games, if these end within `environment_test_frames` frames;
+    number 0 is the final test, of as many games as end within them. Seed and number alone decide
+    all that is random. Returns (score, length in frames) of every game that has ended."""
     games = args.environment_evaluation_episodes if number else math.inf
-    # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
+    # main's generators are made from [seed, 0], the test's from [seed, 1], then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -564,7 +568,7 @@ class Counters:
 
 def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
-    columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
+    columns of Tables 4 to 6; NaN without a finished game; one has variance 0."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
@@ -607,8 +611,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember. A checkpoint is taken when a frame is over, and
-    `frame`, `info` and `game_over` are set anew before they are read."""
+    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (its other attributes are
+    set by the next step) and Gymnasium's RecordEpisodeStatistics."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
@@ -626,8 +630,8 @@ def restore_environment(env: gym.Env, saved: dict) -> None:
 
 
 def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generator]) -> Counters:
-    """Put everything where the checkpoint was taken; nothing in the file is run. Exits with one
-    line if it is not whole, or not of this run."""
+    """Put everything where the checkpoint was taken. weights_only, as a pickle can run a program.
+    Exits with one line if the file is not whole, or not of this run."""
     try:
         if zipfile.ZipFile(path).testzip():
             raise ValueError("a checksum is wrong")
@@ -635,7 +639,7 @@ def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generato
         for name, part in parts.items():
             part.load_state_dict(saved[name])
         restore_environment(env, saved["environment"])
-        # After it: reset() has drawn no-ops.
+        # Last: restore_environment has drawn no-operations from one.
         for rng, state in zip(rngs, saved["rngs"], strict=True):
             rng.bit_generator.state = state
         return Counters(**saved["counters"])
@@ -662,8 +666,9 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 
 def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind."""
-    # For speed alone: Adam's moments of dead units fade below 1e-38, where a CPU is 10 times
-    # slower. They become 0, in the threads, too, which are started after this.
+    # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
+    # below 1e-38 (denormal) a CPU is 10 times slower. Now they are 0, in PyTorch's threads, too,
+    # which are started after this line.
     torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())
     args.threads = torch.get_num_threads()  # into args.json: a resumed run has as many
@@ -707,6 +712,7 @@ def main(args: Args) -> None:
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Learning starts, and slows it down, at frame {args.agent_replay_buffer_initial:,}.")
+    loss = q = torch.zeros(())  # until the first update
 
     def save_q_network() -> None:
         """What it takes to play."""
@@ -730,7 +736,6 @@ def main(args: Args) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
-    loss = q = torch.zeros(())  # until the first update
     started = time.monotonic() - counters.seconds
     checkpoint_time = window_time = time.monotonic()
     window_frames = counters.frames
@@ -749,7 +754,7 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        if "episode" in info:  # a game, not only a life: the statistics are below LifeLoss
+        if "episode" in info:  # a game is over, not only a life: LifeLoss does not make this entry
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
             bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)

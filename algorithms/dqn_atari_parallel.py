@@ -163,7 +163,7 @@ def read_args() -> Args:
             defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        # Once more, with the run's own flags as defaults: no other flag may differ from them.
+        # Once more, with the run's own flags as defaults: whatever differs now was asked for.
         args = tyro.cli(Args, default=defaults)
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
@@ -303,7 +303,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
-    # Gymnasium asks for the space of what comes out; None is that of before, and nobody reads it.
+    # Each also declares the space of its result, which vector environments read. None: as before.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -331,8 +331,8 @@ def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> 
 
 class ReplayShare:
     """One process's part of 𝒟: its last `capacity` transitions (§5.3). A transition is references
-    to 5 frames, an action, a clipped reward and whether s' is terminal; arrays are made when a
-    minibatch is drawn (§7.3.2). Each is whole, so none can mix two episodes or two simulators."""
+    to 5 frames (s' is s moved on by one), an action, a clipped reward and whether s' is terminal;
+    arrays are made when a minibatch is drawn (§7.3.2). None mixes episodes or simulators."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -359,8 +359,9 @@ class ReplayShare:
         return s, a.long(), r, s_next, terminal.bool()
 
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
-        """B histories of LZ4 frames to states (B, 4, 84, 84) uint8 on the device. In memory the 4
-        values of a pixel lie side by side, as the convolutions read them (channels_last)."""
+        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device. In memory
+        the 4 values of a pixel lie side by side, as convolutions read them (channels_last)."""
+        # 4 planes: the k-th frames of all histories in a row. merge puts their pixels side by side.
         planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
         pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
         pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
@@ -387,7 +388,8 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
+        # `update` may have switched the layers to bfloat16 by autocast; Q stays float32.
+        with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
 
 
@@ -439,7 +441,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22 and [8], for whose RMSProp a mean would be too small; Adam divides the scale out.
+    # in line 22. Adam would do the same with a mean; the RMSProp of [8] adds 0.01 to a gradient's
+    # variance, and is meant for sums.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -459,13 +462,12 @@ def passed(count: int, step: int, interval: int) -> bool:
 
 
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
-    """Play whole games at ε_evaluation for raw reward: ten, or what `environment_test_frames` hold.
-
-    Number 0 is the final test, of all these frames. Seed and number alone decide the no-operations
-    and the random actions. Returns (score, length in frames) of every game that was finished.
-    """
+    """Play whole games at ε_evaluation, for raw reward. Evaluations number 1, 2, … are of
+    `environment_evaluation_episodes` games, if these end within `environment_test_frames` frames;
+    number 0 is the final test, of as many games as end within them. Seed and number alone decide
+    all that is random. Returns (score, length in frames) of every game that has ended."""
     games = args.environment_evaluation_episodes if number else math.inf
-    # Seeds: [seed, 0, …] are training's, [seed, 1] is the test's, then the evaluations'.
+    # main's generators are made from [seed, 0], the test's from [seed, 1], then the evaluations'.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -487,7 +489,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
 
 def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
-    columns of Tables 4 to 6; NaN without a finished game, no variance with one."""
+    columns of Tables 4 to 6; NaN without a finished game; one has variance 0."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
@@ -518,8 +520,9 @@ def write_text(path: Path, text: str) -> None:
 
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
-    # For speed alone: Adam's moments of dead units fade below 1e-38, where a CPU is 10 times
-    # slower. They become 0, in the threads, too, which are started after this.
+    # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
+    # below 1e-38 (denormal) a CPU is 10 times slower. Now they are 0, in PyTorch's threads, too,
+    # which are started after this line.
     torch.set_flush_denormal(True)
 
     # 1  Initialize the Atari 2600 simulators.
@@ -562,6 +565,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         # Points after the checkpoint are purged: they are drawn once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
+    loss = q = torch.zeros(())  # until the first update
 
     def save() -> None:
         """q_network.pt, what it takes to play, and checkpoint.pt, what it takes to learn on."""
@@ -579,7 +583,6 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, disable=rank > 0)
-    loss = q = torch.zeros(())  # until the first update
     started = time.monotonic() - counters.seconds
     save_time, stops, due = time.monotonic(), 0, 0
     step = args.num_simulators * ranks  # frames: one of each simulator of each process

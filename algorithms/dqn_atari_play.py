@@ -213,7 +213,8 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        with torch.autocast(x.device.type, enabled=False):  # `update` may ask for bfloat16 layers
+        # `update` may have switched the layers to bfloat16 by autocast; Q stays float32.
+        with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
 
 
