@@ -126,7 +126,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test, and at most of an evaluation [§7.3.3]"""
+    """frames of the final test, and the limit of an evaluation [§7.3.3]"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -284,13 +284,13 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
-    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few games lack it
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
-    # Each also declares the space of its result, which vector environments read. None: as before.
+    # The last argument declares the space of the result, for whoever asks; None leaves it.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -304,9 +304,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 
 class ReplayMemory:
-    """𝒟: the last `capacity` transitions (§5.3): references to 5 frames (s' is s moved on by one),
-    an action, a clipped reward, whether s' is terminal. Arrays are made when a minibatch is drawn
-    (§7.3.2). As no s is cut from a long row of frames, none mixes episodes."""
+    """𝒟: the last `capacity` transitions (§5.3). Each has references to its own 5 frames (s' is s
+    moved on by one), an action, a clipped reward, and whether s' is terminal. Arrays are made when
+    a minibatch is drawn (§7.3.2)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -333,13 +333,14 @@ class ReplayMemory:
         return s, a.long(), r, s_next, terminal.bool()
 
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
-        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device. In memory
-        the 4 values of a pixel lie side by side, as convolutions read them (channels_last)."""
-        # 4 planes: the k-th frames of all histories in a row. merge puts their pixels side by side.
-        planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
-        pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
-        pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
-        return torch.from_numpy(pixels).to(self.device).permute(0, 3, 1, 2)
+        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device."""
+        # The first frames of all histories are joined to one tall picture (B·84, 84), the second
+        # ones to another, and so on: 4. merge makes them the channels of one: then the 4 values of
+        # a pixel lie side by side in memory, as convolutions read them (channels_last).
+        joined = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
+        tall = [np.frombuffer(pixels, np.uint8).reshape(-1, self.shape[2]) for pixels in joined]
+        states = cv2.merge(tall).reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
+        return torch.from_numpy(states).to(self.device).permute(0, 3, 1, 2)  # (B, 4, 84, 84)
 
     def state_dict(self) -> dict:
         """For a checkpoint: every frame once, and per transition the places of its frames. Two
@@ -435,8 +436,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22. Adam would do the same with a mean; the RMSProp of [8] adds 0.01 to a gradient's
-    # variance, and is meant for sums.
+    # in Algorithm 6, not a mean: the 0.01 in the RMSProp of [8] is made for gradients of this size.
+    # Adam's steps do not depend on it.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -448,8 +449,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 class NatureRMSprop(torch.optim.Optimizer):
     """The RMSProp that [8] released (Figure 18): a step is the gradient over the root of its
-    variance; g and n are running means of the gradient and its square. Both decay by 0.95, Figure
-    18's momenta; the step has none. PyTorch's has the constant outside the root."""
+    variance; g and n are running means of the gradient and its square. Figure 18's two momenta
+    are their decay, 0.95, and no momentum of the step. PyTorch's has 0.01 outside the root."""
 
     def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
         super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
@@ -477,7 +478,7 @@ def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
 
 
 def choose_precision(args: Args) -> str:
-    """Time 30 updates of zeros in float32 and bfloat16: the quicker by a tenth, else float32."""
+    """Time 30 updates of zeros in float32 and bfloat16: bfloat16 if it saves a tenth."""
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     q_network = QNetwork(*shape, num_actions=6).to(args.device, memory_format=torch.channels_last)
     optimizer = make_optimizer(args, q_network)
@@ -568,7 +569,7 @@ class Counters:
 
 def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
-    columns of Tables 4 to 6; NaN without a finished game; one has variance 0."""
+    columns of Tables 4 to 6; NaN of no game, variance 0 of one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
@@ -611,18 +612,17 @@ def write_text(path: Path, text: str) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (its other attributes are
-    set by the next step) and Gymnasium's RecordEpisodeStatistics."""
+    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (whose frame, info
+    and game_over the next step sets) and Gymnasium's RecordEpisodeStatistics."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
 
 
 def restore_environment(env: gym.Env, saved: dict) -> None:
-    """Put `env` where `environment_state` was taken."""
-    # Easy to get wrong: if the emulator has not acted yet, the frames after restoreState differ,
-    # from the first action on (in Q*bert and Tetris).
-    env.reset()
+    """Put `env`, which has been reset, where `environment_state` was taken."""
+    # Easy to get wrong: an emulator that has never acted goes on differently after restoreState
+    # (seen in Q*bert and Tetris).
     env.step(0)
     env.unwrapped.ale.restoreState(ale_py.ALEState(saved.pop("emulator")))
     for name, value in saved.items():
@@ -639,7 +639,6 @@ def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generato
         for name, part in parts.items():
             part.load_state_dict(saved[name])
         restore_environment(env, saved["environment"])
-        # Last: restore_environment has drawn no-operations from one.
         for rng, state in zip(rngs, saved["rngs"], strict=True):
             rng.bit_generator.state = state
         return Counters(**saved["counters"])
@@ -667,8 +666,8 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 def main(args: Args) -> None:
     """Algorithm 6, between what it needs and what it leaves behind."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
-    # below 1e-38 (denormal) a CPU is 10 times slower. Now they are 0, in PyTorch's threads, too,
-    # which are started after this line.
+    # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
+    # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())
     args.threads = torch.get_num_threads()  # into args.json: a resumed run has as many
@@ -708,7 +707,7 @@ def main(args: Args) -> None:
         s = env.get_wrapper_attr("history")
     write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
     (run_dir / "test.json").unlink(missing_ok=True)  # of the same run before it was lengthened
-    # Points after the checkpoint are purged: they are drawn once more.
+    # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Learning starts, and slows it down, at frame {args.agent_replay_buffer_initial:,}.")
@@ -754,7 +753,7 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        if "episode" in info:  # a game is over, not only a life: LifeLoss does not make this entry
+        if "episode" in info:  # from RecordEpisodeStatistics, inside LifeLoss: a game is over
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
             bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)

@@ -139,7 +139,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test, and at most of an evaluation [§7.3.3]"""
+    """frames of the final test, and the limit of an evaluation [§7.3.3]"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -297,13 +297,13 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
     env = JoystickActions(env)
-    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few have none
+    no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few games lack it
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
-    # Each also declares the space of its result, which vector environments read. None: as before.
+    # The last argument declares the space of the result, for whoever asks; None leaves it.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -359,13 +359,14 @@ class ReplayShare:
         return s, a.long(), r, s_next, terminal.bool()
 
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
-        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device. In memory
-        the 4 values of a pixel lie side by side, as convolutions read them (channels_last)."""
-        # 4 planes: the k-th frames of all histories in a row. merge puts their pixels side by side.
-        planes = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
-        pixels = cv2.merge([np.frombuffer(plane, np.uint8) for plane in planes])  # (B·84·84, 1, 4)
-        pixels = pixels.reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
-        return torch.from_numpy(pixels).to(self.device).permute(0, 3, 1, 2)
+        """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device."""
+        # The first frames of all histories are joined to one tall picture (B·84, 84), the second
+        # ones to another, and so on: 4. merge makes them the channels of one: then the 4 values of
+        # a pixel lie side by side in memory, as convolutions read them (channels_last).
+        joined = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
+        tall = [np.frombuffer(pixels, np.uint8).reshape(-1, self.shape[2]) for pixels in joined]
+        states = cv2.merge(tall).reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
+        return torch.from_numpy(states).to(self.device).permute(0, 3, 1, 2)  # (B, 4, 84, 84)
 
 
 # ---- network -------------------------------------------------------------------------------------
@@ -441,8 +442,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in line 22. Adam would do the same with a mean; the RMSProp of [8] adds 0.01 to a gradient's
-    # variance, and is meant for sums.
+    # in Algorithm 6, not a mean: the 0.01 in the RMSProp of [8] is made for gradients of this size.
+    # Adam's steps do not depend on it.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -489,7 +490,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
 
 def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
-    columns of Tables 4 to 6; NaN without a finished game; one has variance 0."""
+    columns of Tables 4 to 6; NaN of no game, variance 0 of one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
@@ -521,8 +522,8 @@ def write_text(path: Path, text: str) -> None:
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
-    # below 1e-38 (denormal) a CPU is 10 times slower. Now they are 0, in PyTorch's threads, too,
-    # which are started after this line.
+    # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
+    # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
 
     # 1  Initialize the Atari 2600 simulators.
@@ -562,7 +563,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
         (run_dir / "test.json").unlink(missing_ok=True)  # of the same run before it was lengthened
-        # Points after the checkpoint are purged: they are drawn once more.
+        # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     loss = q = torch.zeros(())  # until the first update
