@@ -597,7 +597,7 @@ def write_test(path: Path, counters: Counters, finished: list) -> None:
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
     one, never a part. Exits with one line if the disk refuses."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.absolute().with_name(path.name + ".tmp")
     try:
         write(temporary)
         temporary.replace(path)

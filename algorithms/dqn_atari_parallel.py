@@ -502,7 +502,7 @@ def summary(counters, finished: list[tuple[float, int]]) -> dict:
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
     one, never a part. Exits with one line if the disk refuses."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.absolute().with_name(path.name + ".tmp")
     try:
         write(temporary)
         temporary.replace(path)
@@ -702,7 +702,8 @@ def main(args: Args) -> None:
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
     # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead,
     # which has imported the slow modules once for all simulators.
-    multiprocessing.set_forkserver_preload(["torch.utils.tensorboard", "gymnasium", "tyro"])
+    slow_modules = ["gymnasium", "pandas", "torch.utils.tensorboard", "tyro"]
+    multiprocessing.set_forkserver_preload(slow_modules)
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)
     try:

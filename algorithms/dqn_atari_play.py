@@ -440,7 +440,8 @@ def main(args: Args) -> None:
     shown = rows[: int(args.video_seconds * FRAMES_PER_SECOND)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(rows).to_csv(folder / "trace.csv", index=False)
+        table = pd.DataFrame(rows)
+        table.to_csv(folder.absolute() / "trace.csv", index=False, float_format="%.6g")
         draw_curves(rows, q, moments, trained).savefig(folder / "values.png", dpi=100)
         draw_moments(rows, screens, moments).savefig(folder / "moments.png", dpi=100)
         write_video(folder, pictures(shown, q, screens, trained))
