@@ -438,7 +438,7 @@ def test_rmsprop_is_the_one_that_nature_released():
 def test_bfloat16_only_where_it_is_quicker_by_a_clear_margin(monkeypatch, bfloat16, choice):
     seconds, seen, update = {"float32": 1.0, "bfloat16": bfloat16}, [], dqn.update
     monkeypatch.setattr(dqn, "update", lambda *all: seen.append(all[-1]) or update(*all))
-    monkeypatch.setattr(dqn.timeit, "repeat", lambda work, **_: (work(), [seconds[seen[-1]]])[1])
+    monkeypatch.setattr(dqn.timeit, "timeit", lambda work, **_: (work(), seconds[seen[-1]])[1])
     assert dqn.choose_precision(dqn.Args(device="cpu", optimizer_minibatch_size=2)) == choice
 
 
