@@ -150,7 +150,8 @@ def read_args() -> Args:
             defaults = Args(**saved | {"resume": args.resume})
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
-        # Once more, with the run's own flags as defaults: whatever differs now was asked for.
+        # Once more, with the run's own flags as defaults: whatever differs now was typed. It can
+        # be a larger number of frames (a smaller one is not the maximum), nothing else.
         args = tyro.cli(Args, default=defaults)
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
@@ -335,8 +336,8 @@ class ReplayMemory:
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
         """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device."""
         # The first frames of all histories are joined to one tall picture (B·84, 84), the second
-        # ones to another, and so on: 4. merge makes them the channels of one: then the 4 values of
-        # a pixel lie side by side in memory, as convolutions read them (channels_last).
+        # ones to another, and so on. cv2.merge makes these 4 pictures the channels of a single one:
+        # the 4 values of a pixel lie side by side in memory, as convolutions read them.
         joined = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
         tall = [np.frombuffer(pixels, np.uint8).reshape(-1, self.shape[2]) for pixels in joined]
         states = cv2.merge(tall).reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
@@ -436,8 +437,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in Algorithm 6, not a mean: the 0.01 in the RMSProp of [8] is made for gradients of this size.
-    # Adam's steps do not depend on it.
+    # in Algorithm 6. A mean makes the gradient 32 times smaller: Adam's steps stay the same, but it
+    # is too small beside the 0.01 in the RMSProp of [8], below.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -449,8 +450,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
 class NatureRMSprop(torch.optim.Optimizer):
     """The RMSProp that [8] released (Figure 18): a step is the gradient over the root of its
-    variance; g and n are running means of the gradient and its square. Figure 18's two momenta
-    are their decay, 0.95, and no momentum of the step. PyTorch's has 0.01 outside the root."""
+    variance; g and n are running means of the gradient and its square. Figure 18 calls their decays
+    momentum, 0.95 twice. torch.optim.RMSprop adds its constant to the root, not to the variance."""
 
     def __init__(self, parameters, lr: float, decay: float = 0.95, constant: float = 0.01):
         super().__init__(parameters, {"lr": lr, "decay": decay, "constant": constant})
@@ -614,8 +615,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (whose frame, info
-    and game_over the next step sets) and Gymnasium's RecordEpisodeStatistics."""
+    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (its frame, info and
+    game_over come from the next step: no reset is due now) and RecordEpisodeStatistics."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
