@@ -9,8 +9,10 @@ The same game, minibatch of 32, replay ratio, learning rate and interval of targ
 processes of their own that take turns, 96 frames each while the others wait: all see the same
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
-as there are simulators. All are on the CPU and warm up for 1,000 frames without learning and 1,000
-with.
+as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
+with. With 1,000 frames in the replay memory, the C library gave the memory of each of our updates
+back to the system (3,500 page faults an update, 15 ms instead of 12); with 5,000 there are none,
+and none in a run of hours.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
 when it is old: moments of half of its units denormal, with and without the flag that flushes
@@ -35,7 +37,8 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
 TURN = 96  # frames: whole steps of 1, 2, 4 and 8 simulators
-WARM_UP = 21 * TURN  # frames, about half of them with learning
+FILLED = 5_000  # frames before learning starts
+WARM_UP = 63 * TURN  # frames, the last 1,000 with learning
 
 
 @dataclasses.dataclass
@@ -82,8 +85,8 @@ def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
     with tempfile.TemporaryDirectory() as folder:
         dqn.main(dqn.Args(
             env_id=args.env_id, device="cpu", runs_dir=folder,
-            environment_train_frames_max=WARM_UP + args.frames, agent_replay_buffer_initial=1000,
-            agent_epsilon_greedy_annealing=1000, environment_test_frames=1, **flags))
+            environment_train_frames_max=WARM_UP + args.frames, agent_replay_buffer_initial=FILLED,
+            agent_epsilon_greedy_annealing=FILLED, environment_test_frames=1, **flags))
 
 
 def ours(args: Args, turns: Turns, **flags) -> None:
@@ -127,10 +130,10 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
     env = make_atari_env(args.env_id, n_envs=envs, seed=1, env_kwargs=same_game)
     frames = WARM_UP + args.frames
     model = DQN("CnnPolicy", VecFrameStack(env, n_stack=4), learning_rate=1e-4, buffer_size=frames,
-                learning_starts=1000, batch_size=32, target_update_interval=1000,
+                learning_starts=FILLED, batch_size=32, target_update_interval=1000,
                 train_freq=max(1, agent_update_frequency // envs),
                 gradient_steps=max(1, envs // agent_update_frequency),
-                exploration_fraction=1000 / frames, exploration_final_eps=0.01, seed=1,
+                exploration_fraction=FILLED / frames, exploration_final_eps=0.01, seed=1,
                 device="cpu")
     model.learn(frames, callback=Clock())
 
@@ -191,7 +194,7 @@ def parts(args: Args) -> dict[str, float]:
     script_args = dqn.Args(env_id=args.env_id, device="cpu")
     rng = np.random.default_rng(0)
     env = dqn.FrameHistory(dqn.make_env(script_args, rng, training=True), 4)
-    replay = dqn.ReplayMemory(2_000, (4, 84, 84), "cpu")
+    replay = dqn.ReplayMemory(FILLED, (4, 84, 84), "cpu")
     q_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n))
     q_network.to(memory_format=torch.channels_last)
     target_network = copy.deepcopy(q_network).requires_grad_(False)
@@ -220,7 +223,7 @@ def parts(args: Args) -> dict[str, float]:
             optimizer.state[θ]["exp_avg"][..., ::2] = 1e-40
             optimizer.state[θ]["exp_avg_sq"][..., ::2] = 1e-40
 
-    frame = milliseconds(step, 2_000)
+    frame = milliseconds(step, FILLED)
     emulator = milliseconds(emulate, 2_000)
     minibatch = replay.gather(rng.integers(len(replay), size=32))
     times = {
