@@ -12,7 +12,7 @@ Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as m
 as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
 with. With 1,000 frames in the replay memory, the C library gave the memory of each of our updates
 back to the system (3,500 page faults an update, 15 ms instead of 12); with 5,000 there are none,
-and none in a run of hours.
+and hardly any in a run of hours.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
 when it is old: moments of half of its units denormal, with and without the flag that flushes
