@@ -444,7 +444,7 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
     # in Algorithm 6. A mean makes the gradient 32 times smaller: Adam's steps stay the same, but it
-    # is too small beside the 0.01 in the RMSProp of [8], below.
+    # is too small beside the 0.01 that the RMSProp of [8] adds to a variance.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()

@@ -10,9 +10,8 @@ processes of their own that take turns, 96 frames each while the others wait: al
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
 as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
-with. With 1,000 frames in the replay memory, the C library gave the memory of each of our updates
-back to the system (3,500 page faults an update, 15 ms instead of 12); with 5,000 there are none,
-and hardly any in a run of hours.
+with. With fewer frames in the replay memory, the C library gives the memory of an update back to the
+system after each, and its page faults are timed, which a run of hours hardly has.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
 when it is old: moments of half of its units denormal, with and without the flag that flushes
