@@ -10,7 +10,7 @@ processes of their own that take turns, 96 frames each while the others wait: al
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
 as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
-with. With fewer frames in the replay memory, the C library gives the memory of an update back to the
+with. With fewer frames in the replay memory, the C library gives an update's memory back to the
 system after each, and its page faults are timed, which a run of hours hardly has.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
