@@ -10,8 +10,8 @@ processes of their own that take turns, 96 frames each while the others wait: al
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
 as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
-with. With fewer frames in the replay memory, the C library gives an update's memory back to the
-system after each, and its page faults are timed, which a run of hours hardly has.
+with: until a run has freed a large block of memory, the C library of Linux gives an update's memory
+back to the system after each, and page faults are timed that a run of hours hardly has.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
 when it is old: moments of half of its units denormal, with and without the flag that flushes
@@ -270,8 +270,10 @@ def in_a_process(call, *args):
 
 
 def flushed_parts(args: Args) -> dict[str, float]:
-    """`parts` as in a run: denormal numbers flushed before the first parallel work."""
+    """`parts` as in a run: denormal numbers flushed before the first parallel work, and a large
+    block of memory freed before, which a run of dqn_atari.py does when it counts dead units."""
     torch.set_flush_denormal(True)
+    torch.empty(30 * 2**20, dtype=torch.uint8)
     return parts(args)
 
 
