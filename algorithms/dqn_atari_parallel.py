@@ -6,17 +6,18 @@
 # ]
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
-§7.3.2): dqn_atari.py, which waits for one simulator, made parallel. It drops exact resume, the lock
-on a run, checksums, RMSProp, --threads, the choice of the precision, the count of dead units, and
-of test.json all but the table's figures and the scores. The flags up to --optimizer-learning-rate
-are Table 3's; from --env-id on they are this script's own.
+§7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
+epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a run, checksums,
+RMSProp, --threads, the choice of the precision, the count of dead units, and of test.json all but
+the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
 
-    simulators       | s, a -> r, s' | s, a -> r, s' |    N processes, a frame of each in a step
-    network       act|  updates   act|  updates   act|    N actions from one batch; it learns while
+    simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
+                                                          each
+    learner       act|  updates   act|  updates   act|    N actions from one batch; it learns while
                                                           the simulators step
-    processes of torchrun have N simulators and a part of 𝒟 each; θ is the same in all: the
-    gradient of an update is the mean of theirs. Number 0 evaluates, logs and writes, the others
-    wait. Every number of Table 3 is a total over the processes.
+    torchrun starts more learners, its ranks, with N simulators and a part of 𝒟 each. θ is the same
+    in all: the gradient of an update is the mean of theirs. Rank 0, the only one without torchrun,
+    evaluates, logs and writes; the others wait. Table 3's counts are totals over the ranks.
 
 Run it
     python algorithms/dqn_atari_parallel.py --num-simulators 8 --agent-update-frequency 4
@@ -34,14 +35,15 @@ Deviations, beside those of dqn_atari.py
     ------------------------------------  ----------------------------------  --------------------
     an update follows its frame           updates sample 𝒟 without the        emulation and learn-
                                           frames that are under way           ing at the same time
-    counts go up by 1                     by N × processes; ε, copies and     simulators step
-                                          evaluations at the next step        together
-    ℬ ⊆ 𝒟                                 each process draws its share of ℬ   no transition travels
+    frames are counted one by one         N × ranks at a time; a copy or an   simulators step
+                                          evaluation waits for the step's end together
+    ℬ ⊆ 𝒟                                 each rank draws its share of ℬ      no transition travels
                                           from its part of 𝒟
-    Σ over ℬ (line 22)                    Σ over ℬ / processes                Adam has no scale
-    A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
-    acts until that holds the initial number (these frames count), then learns on; its random
-    numbers start anew. On several machines all need runs/.
+    Σ over ℬ (line 22)                    Σ over ℬ / ranks                    Adam divides it out
+
+A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
+acts until that holds the initial number (these frames count), then learns on; its random numbers
+start anew. On several machines, all must see runs/RUN.
 """
 
 import copy
@@ -93,7 +95,7 @@ class Args:
     environment_evaluation_interval_episodes: int = 500
     """episodes between evaluations"""
     environment_checkpoint_interval_episodes: int = 500
-    """episodes between two writings of q_network.pt"""
+    """episodes between two savings, of q_network.pt and checkpoint.pt, at most"""
     environment_no_op_max: int = 30
     """a game starts with up to this many no-operations, in emulator frames"""
     environment_reward_clip_limit: float = 1.0
@@ -125,7 +127,7 @@ class Args:
     agent_replay_buffer_maximum_length: int = 1_000_000
     """transitions that the replay memory holds; the oldest give way"""
     optimizer_name: Literal["Adam"] = "Adam"
-    """the RMSProp of [8] is in dqn_atari.py alone"""
+    """nothing else: the RMSProp of [8] is in dqn_atari.py alone"""
     optimizer_minibatch_size: int = 32
     """transitions in a minibatch"""
     optimizer_q_network_parameter_update_interval_frames: int = 1_000
@@ -145,9 +147,9 @@ class Args:
     precision: Literal["float32", "bfloat16"] = "float32"
     """of an update's layers"""
     num_simulators: int = 8
-    """simulators of each process of torchrun"""
+    """simulators of each rank"""
     checkpoint_interval_minutes: float = 10.0
-    """minutes between checkpoints of the learner"""
+    """minutes between two savings, at most"""
     resume: str = ""
     """run directory to go on with; only --environment-train-frames-max may be raised"""
     runs_dir: str = "runs"
@@ -314,16 +316,16 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     return env
 
 
-def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> gym.Env:
-    """The game, up to the frame, in a process of its own, which ends when its pipe is closed.
-    AsyncVectorEnv makes one more in the process with the number `learner`, for its spaces."""
-    if os.getpid() != learner:
+def make_simulator(args: Args, no_op_rng: np.random.Generator, learner_pid: int) -> gym.Env:
+    """The game without FrameHistory, in a process of its own, which ends when its pipe is closed.
+    AsyncVectorEnv makes one more in the learner's process, for its spaces."""
+    if os.getpid() != learner_pid:
         # The learner answers signals and reports errors: the terminal's and torchrun's signals do
         # not reach another session, and an error comes to the learner through the pipe.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if os.name == "posix":
             os.setsid()
-        if sys.platform == "linux":  # a simulator waits until the learner's threads pause
+        if sys.platform == "linux":  # it takes a free core at once, but interrupts no learner
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         sys.stderr = open(os.devnull, "w")
     return make_env(args, no_op_rng, training=True)
@@ -333,9 +335,9 @@ def make_simulator(args: Args, no_op_rng: np.random.Generator, learner: int) -> 
 
 
 class ReplayShare:
-    """One process's part of 𝒟: its last `capacity` transitions (§5.3). A transition is references
-    to 5 frames (s' is s moved on by one), an action, a clipped reward and whether s' is terminal;
-    arrays are made when a minibatch is drawn (§7.3.2). None mixes episodes or simulators."""
+    """A rank's part of 𝒟, dqn_atari.py's ReplayMemory but for its state_dict: the last `capacity`
+    transitions (§5.3). Each has references to its own 5 frames (s' is s moved on by one), so none
+    mixes episodes or simulators; arrays are made when a minibatch is drawn (§7.3.2)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -456,10 +458,9 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
     return loss.detach() / len(r), q.detach()
 
 
-def passed(count: int, step: int, interval: int) -> bool:
-    """Whether `count`, which has gone up by `step`, has come to a multiple of `interval`, or past
-    one."""
-    return count // interval > (count - step) // interval
+def passed(count: int, step: int, interval: int) -> int:
+    """How many multiples of `interval` `count` has come to, or past, by going up by `step`."""
+    return count // interval - (count - step) // interval
 
 
 # ---- evaluation ----------------------------------------------------------------------------------
@@ -523,26 +524,26 @@ def write_text(path: Path, text: str) -> None:
 
 
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
-    """Algorithm 6 in process number `rank` of `ranks`. Number 0 evaluates, logs and writes."""
+    """Algorithm 6 in one of `ranks` processes. Rank 0 evaluates, logs and writes."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
     # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
     # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
-    # Likewise: once the C library of Linux has seen a block of 30 MB come and go, it keeps up to 60
-    # MB that are free. Before, it gives an update's memory back, and the next update pays for it
-    # with 4,000 page faults.
+    # For speed alone, on Linux: once a block of 30 MB has been freed, the C library keeps up to 60
+    # MB that are free. Else it gives an update's memory back to the system, and the next update
+    # pays for that with 4,000 page faults. (In dqn_atari.py the count of dead units frees more.)
     torch.empty(30 * 2**20, dtype=torch.uint8)
 
-    # 1  Initialize the Atari 2600 simulators.
+    # 1  Initialize the Atari 2600 simulators; simulator i of all has the seed `seed` + i.
     actions = envs.get_attr("meanings")[0]
     x, _ = envs.reset(seed=args.seed + rank * args.num_simulators)  # (N, 84, 84) uint8
-    # dqn_atari.py's FrameHistory, but on this side of the pipe: N histories of LZ4 bytes
+    # N histories of LZ4 bytes, as FrameHistory's, but made here: a frame passes the pipe once.
     s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]
     # 2  Initialize 𝒟.
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     replay = ReplayShare(args.agent_replay_buffer_maximum_length // ranks, shape, args.device)
     # 3  Initialize θ.
-    torch.manual_seed(args.seed)
+    torch.manual_seed(args.seed)  # the same θ in all ranks
     q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
@@ -562,7 +563,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
             vars(counters).update(saved["counters"])
         except Exception as error:  # a damaged file can raise anything
             raise SystemExit(f"error: {path} cannot be resumed from: {error!r:.200}") from None
-    # The same θ, under a wrapper that averages the gradients of all processes in backward().
+    # The same θ, under a wrapper that averages the gradients of all ranks in backward().
     shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
     if rank == 0:
         name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
@@ -576,7 +577,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     loss = q = torch.zeros(())  # until the first update
 
     def save() -> None:
-        """q_network.pt, what it takes to play, and checkpoint.pt, what it takes to learn on."""
+        """Of rank 0: q_network.pt, what it takes to play, and checkpoint.pt, to learn on."""
         if not loss.isfinite():  # a NaN never leaves the weights again
             raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
         writer.flush()
@@ -587,62 +588,58 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         content["counters"] = vars(counters)
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    stop = []  # signals so far: with one, the loop ends after the step, or the evaluation
+    signals = []  # to this rank: with one to any, the loop ends after the step, or the evaluation
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
+        signal.signal(number, lambda number, _: signals.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, disable=rank > 0)
     started = time.monotonic() - counters.seconds
-    save_time, stops, due = time.monotonic(), 0, 0
-    step = args.num_simulators * ranks  # frames: one of each simulator of each process
+    save_time, stopping = time.monotonic(), 0
+    step = args.num_simulators * ranks  # frames: one of each simulator of each rank
+    batch_size = args.optimizer_minibatch_size // ranks
 
     # 8, 30  while total_frames < number of frames to train
-    while counters.frames < args.environment_train_frames_max and not stops:
+    while counters.frames < args.environment_train_frames_max and not stopping:
+        # 9-13  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
+        epsilon = epsilon_at(counters.frames, args)
+        a = epsilon_greedy_batch(q_network, replay.decode(s), epsilon, exploration_rng)  # (N,)
+        envs.step_async(a)
         counters.frames += step
 
-        # 9-12  Perform ε-greedy actions, π(s) = argmax_a Q(s, a; θ), one in each simulator.
-        epsilon = epsilon_at(counters.frames - step, args)
-        states = replay.decode(s)  # (N, 4, 84, 84)
-        a = epsilon_greedy_batch(q_network, states, epsilon, exploration_rng)  # (N,)
-        envs.step_async(a)
-
-        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, while an update is due for the
-        # frames so far. Before lines 13-17, unlike in Algorithm 6: the simulators step meanwhile.
+        # 18-23  If |𝒟| ≥ initial: sample ℬ ⊆ 𝒟, gradient descent, once for every multiple of the
+        # update frequency. 𝒟 lacks this step's transitions: the simulators step meanwhile.
         if replay.added * ranks >= args.agent_replay_buffer_initial:
-            due += step  # frames for which no update has been made
-        while due >= args.agent_update_frequency:
-            due -= args.agent_update_frequency
-            batch_size = args.optimizer_minibatch_size // ranks
-            minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
-            loss, q = update(shared_network, target_network, optimizer, minibatch,
-                             args.agent_discount_factor, args.precision)
-            counters.updates += 1
+            for _ in range(passed(counters.frames, step, args.agent_update_frequency)):
+                minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
+                loss, q = update(shared_network, target_network, optimizer, minibatch,
+                                 args.agent_discount_factor, args.precision)
+                counters.updates += 1
 
         # 24-26  θ⁻ = θ
         if passed(counters.frames, step, args.optimizer_q_network_parameter_update_interval_frames):
             target_network.load_state_dict(q_network.state_dict())
 
-        # 13-17  Add (s, a, r, s') to 𝒟. A simulator whose episode has ended has reset itself.
+        # 10, 14-17  Add (s, a, r, s') to 𝒟. A simulator whose episode has ended has reset itself.
         x, r, terminated, truncated, info = envs.step_wait()  # (N, 84, 84) uint8, (N,) each
         ended = terminated | truncated
         for i in range(args.num_simulators):
-            # Easy to get wrong: after an end x[i] is the next episode's first frame (SAME_STEP),
-            # and the last frame of s' is in info.
-            last = info["final_obs"][i] if ended[i] else x[i]
-            s_next = (*s[i][1:], lz4.block.compress(last))
+            # Easy to get wrong: after an end x[i] is the next episode's first frame
+            # (AutoresetMode.SAME_STEP, in main), and the last frame of s' is in info.
+            frame = info["final_obs"][i] if ended[i] else x[i]
+            s_next = (*s[i][1:], lz4.block.compress(frame))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
-            s[i] = (lz4.block.compress(x[i]),) * len(s_next) if ended[i] else s_next
+            s[i] = (lz4.block.compress(x[i]),) * args.agent_history_length if ended[i] else s_next
 
-        # The processes agree on the number of episodes, and whether one of them is to stop: then
-        # all leave the loop together.
-        sums = torch.tensor([ended.sum(), len(stop)])
+        # The ranks agree on the number of episodes, and whether one of them is to stop: then all
+        # leave the loop together.
+        sums = torch.tensor([ended.sum(), len(signals)])
         if ranks > 1:
             distributed.all_reduce(sums)
-        episodes, stops = sums.tolist()
-        counters.episodes += episodes
+        ends, stopping = sums.tolist()  # episodes that have ended now; signals so far
+        counters.episodes += ends
         if rank > 0:
-            continue  # the rest is number 0's
+            continue  # the rest is rank 0's
 
-        # Of the simulators whose game, not only a life, is over.
+        # Log rank 0's games that are over: "_episode" is True where not only a life has ended.
         games = info.get("final_info", {})
         for i in np.flatnonzero(games.get("_episode", ())):
             score, length = games["episode"]["r"][i], games["episode"]["l"][i]
@@ -651,7 +648,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
             bar.set_postfix_str(f"score {score:g}, ε {epsilon:.2f}", refresh=False)
 
         # 27-29  Evaluate the agent.
-        if passed(counters.episodes, episodes, args.environment_evaluation_interval_episodes):
+        if passed(counters.episodes, ends, args.environment_evaluation_interval_episodes):
             finished = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
             table = pd.DataFrame(counters.evaluations).set_index("frames")
@@ -664,11 +661,11 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         counters.seconds = time.monotonic() - started
         if passed(counters.frames, step, REPORT_INTERVAL):
             writer.add_scalar("charts/SPS", bar.format_dict["rate"] or 0, counters.frames)
-            writer.add_scalar("losses/td_loss", loss, counters.frames)  # of number 0's share of ℬ
+            writer.add_scalar("losses/td_loss", loss, counters.frames)  # of rank 0's share of ℬ
             writer.add_scalar("losses/q_values", q.mean(), counters.frames)
         late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes
         interval = args.environment_checkpoint_interval_episodes
-        if late or passed(counters.episodes, episodes, interval):
+        if late or passed(counters.episodes, ends, interval):
             save()
             save_time = time.monotonic()
 
@@ -679,21 +676,24 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         print(f"frame {counters.frames:,}; to go on: --resume {run_dir}")
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
-    if rank == 0 and not (stops or stop):
+    if stopping and not signals:
+        signals.append(signal.SIGTERM)  # another rank's
+    if rank == 0 and not signals:
         finished = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
         write_text(run_dir / "test.json", json.dumps(test, indent=2))
     if ranks > 1:
-        # The others wait for number 0: when one ends with an error, torchrun kills all.
+        # All wait for rank 0: of a stopped run each ends with a code above 0, and with the first
+        # torchrun kills the rest.
         distributed.barrier()
         distributed.destroy_process_group()
-    if stops or stop:
-        raise SystemExit(128 + (stop or [signal.SIGTERM])[0])  # or: another process was to stop
+    if signals:
+        raise SystemExit(128 + signals[0])  # the shell's code for a signal
 
 
 def main(args: Args) -> None:
-    """One process of the run: its place among the others, its simulators, and `learn`."""
+    """A learner: its place among the others, as torchrun tells it, its simulators, and `learn`."""
     rank, ranks = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     if args.device == "auto":
         args.device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -701,13 +701,13 @@ def main(args: Args) -> None:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
-    if ranks > 1:  # gloo on CPUs, NCCL on GPUs; the others wait while number 0 evaluates
+    if ranks > 1:  # gloo for CPUs, NCCL for GPUs; the others wait while rank 0 evaluates
         distributed.init_process_group(timeout=datetime.timedelta(days=1))
 
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
-    # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead,
-    # which has imported the slow modules once for all simulators.
+    # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead.
+    # Each simulator imports this file; the server has imported its slow modules once for all.
     multiprocessing.set_forkserver_preload(["gymnasium", "pandas", "torch.utils.tensorboard"])
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)
@@ -715,13 +715,13 @@ def main(args: Args) -> None:
         learn(args, envs, *rngs[:2], rank, ranks)
     except Exception as error:
         lost = isinstance(error, (EOFError, ConnectionError, distributed.DistError))
-        if lost or "by peer" in str(error):  # gloo's is a plain RuntimeError
+        if lost or "by peer" in str(error):  # gloo's RuntimeError: "Connection closed by peer"
             raise SystemExit(f"error: a process of the run has died: {error!r:.120}") from None
         raise
     finally:
         for process in envs.processes:
             process.terminate()
-        envs.closed = True  # its own close() would wait for the dead
+        envs.closed = True  # its own close() would first talk to them, dead ones, too
 
 
 if __name__ == "__main__":

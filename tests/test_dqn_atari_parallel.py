@@ -122,8 +122,8 @@ def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency):
               environment_train_frames_max=240,
               optimizer_q_network_parameter_update_interval_frames=50)
     frames = range(simulators, 240 + simulators, simulators)
-    start = min(n for n in frames if n >= 100)
-    assert run.steps == [(simulators, n, max(0, n - start) // frequency) for n in frames]
+    first = min(n for n in frames if n >= 100) // frequency  # multiple: no update
+    assert run.steps == [(simulators, n, max(0, n // frequency - first)) for n in frames]
     assert (run.result["frames"], run.result["updates"]) == (240, len(run.updates))
     assert min(update["frames"] for update in run.updates) >= 100
     target, done = run.updates[0]["before"], 0
