@@ -40,9 +40,8 @@ class Run:
     """main() in this process: its memory, no-op generators at the start, updates and steps."""
 
     def __init__(self, folder: Path, **flags):
-        run, self.updates, self.steps = self, [], []
+        run, self.updates, self.steps, self.epsilon_frames = self, [], [], []
         make_memory, make_envs = parallel.ReplayShare, parallel.AsyncVectorEnv
-        original_update = parallel.update
 
         def memory(*arguments):
             run.memory = make_memory(*arguments)
@@ -59,7 +58,7 @@ class Run:
 
         def update(q_network, target_network, optimizer, *rest):
             before = q_network.head.weight.detach().clone()
-            result = original_update(q_network, target_network, optimizer, *rest)
+            result = serial.update(q_network, target_network, optimizer, *rest)
             run.updates.append({
                 "frames": len(run.memory), "target": target_network.head.weight.clone(),
                 "before": before, "after": q_network.head.weight.detach().clone(),
@@ -68,7 +67,8 @@ class Run:
 
         with pytest.MonkeyPatch.context() as patch:
             spies = dict(ReplayShare=memory, AsyncVectorEnv=envs, tqdm=Bar, update=update,
-                         make_simulator=make_capped_simulator)
+                         make_simulator=make_capped_simulator, epsilon_at=lambda frame, args:
+                         run.epsilon_frames.append(frame) or serial.epsilon_at(frame, args))
             for name, spy in spies.items():
                 patch.setattr(parallel, name, spy)
             parallel.main(parallel.Args(**(SHORT | {"runs_dir": str(folder)} | flags)))
@@ -125,7 +125,7 @@ def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency):
     first = min(n for n in frames if n >= 100) // frequency  # multiple: no update
     assert run.steps == [(simulators, n, max(0, n // frequency - first)) for n in frames]
     assert (run.result["frames"], run.result["updates"]) == (240, len(run.updates))
-    assert min(update["frames"] for update in run.updates) >= 100
+    assert run.epsilon_frames == [n - simulators for n in frames]
     target, done = run.updates[0]["before"], 0
     for _, n, updates in run.steps:
         for update in run.updates[done:updates]:
