@@ -8,8 +8,8 @@
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
 epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a run, checksums,
-RMSProp, --threads, the choice of the precision, the count of dead units, and of test.json all but
-the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
+RMSProp, --threads, the choice of the precision, dead units, charts/epsilon, and of test.json all
+but the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
                                                           each
@@ -35,8 +35,8 @@ Deviations, beside those of dqn_atari.py
     ------------------------------------  ----------------------------------  --------------------
     an update follows its frame           updates sample 𝒟 without the        emulation and learn-
                                           frames that are under way           ing at the same time
-    frames are counted one by one         N × ranks at a time; a copy or an   simulators step
-                                          evaluation waits for the step's end together
+    frames are counted one by one         N × ranks at a time; θ is copied    simulators step
+                                          after the step's updates            together
     ℬ ⊆ 𝒟                                 each rank draws its share of ℬ      no transition travels
                                           from its part of 𝒟
     Σ over ℬ (line 22)                    Σ over ℬ / ranks                    Adam divides it out
@@ -46,6 +46,7 @@ acts until that holds the initial number (these frames count), then learns on; i
 start anew. On several machines, all must see runs/RUN.
 """
 
+import contextlib
 import copy
 import dataclasses
 import datetime
@@ -320,12 +321,11 @@ def make_simulator(args: Args, no_op_rng: np.random.Generator, learner_pid: int)
     """The game without FrameHistory, in a process of its own, which ends when its pipe is closed.
     AsyncVectorEnv makes one more in the learner's process, for its spaces."""
     if os.getpid() != learner_pid:
-        # The learner answers signals and reports errors: the terminal's and torchrun's signals do
-        # not reach another session, and an error comes to the learner through the pipe.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if os.name == "posix":
-            os.setsid()
-        if sys.platform == "linux":  # it takes a free core at once, but interrupts no learner
+        # The learner answers signals, and reports an error in a step: it comes through the pipe.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        # For speed alone: it takes a free core at once, a busy one only at the scheduler's tick.
+        with contextlib.suppress(AttributeError, OSError):  # not on Linux; refused
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         sys.stderr = open(os.devnull, "w")
     return make_env(args, no_op_rng, training=True)
@@ -529,15 +529,15 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
     # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
-    # For speed alone, on Linux: once a block of 30 MB has been freed, the C library keeps up to 60
-    # MB that are free. Else it gives an update's memory back to the system, and the next update
-    # pays for that with 4,000 page faults. (In dqn_atari.py the count of dead units frees more.)
+    # For speed alone, on Linux: once a block of 30 MB (at most 32) has been freed, the C library
+    # keeps up to 60 MB that are free. Else it gives an update's memory back to the system, and the
+    # next one pays for that with 4,000 page faults. (dqn_atari.py's dead_units frees such a block.)
     torch.empty(30 * 2**20, dtype=torch.uint8)
 
     # 1  Initialize the Atari 2600 simulators; simulator i of all has the seed `seed` + i.
     actions = envs.get_attr("meanings")[0]
     x, _ = envs.reset(seed=args.seed + rank * args.num_simulators)  # (N, 84, 84) uint8
-    # N histories of LZ4 bytes, as FrameHistory's, but made here: a frame passes the pipe once.
+    # N histories of LZ4 bytes, as FrameHistory's, but made here: a frame crosses once.
     s = [(lz4.block.compress(frame),) * args.agent_history_length for frame in x]
     # 2  Initialize 𝒟.
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
@@ -702,7 +702,8 @@ def main(args: Args) -> None:
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
     if ranks > 1:  # gloo for CPUs, NCCL for GPUs; the others wait while rank 0 evaluates
-        distributed.init_process_group(timeout=datetime.timedelta(days=1))
+        backend = "cpu:gloo,cuda:nccl" if args.device == "cuda" else "gloo"
+        distributed.init_process_group(backend, timeout=datetime.timedelta(days=1))
 
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
@@ -720,7 +721,7 @@ def main(args: Args) -> None:
         raise
     finally:
         for process in envs.processes:
-            process.terminate()
+            process.kill()
         envs.closed = True  # its own close() would first talk to them, dead ones, too
 
 

@@ -107,7 +107,15 @@ def ours_parallel(args: Args, turns: Turns | None, ranks: int, rank: int = 0, **
             multiprocessing.get_context("spawn").Process(
                 target=ours_parallel, args=(args, None), kwargs=others).start()
         torch.set_num_threads(1)  # as torchrun does
-    run_script(dqn_atari_parallel, args, turns, **flags)
+        all_reduce = dqn_atari_parallel.distributed.all_reduce
+
+        def in_turn(sums: torch.Tensor) -> None:
+            if rank == 0:  # it takes its turn here, where the other waits for it
+                turns.step(ranks * flags["num_simulators"])
+            all_reduce(sums)
+
+        dqn_atari_parallel.distributed.all_reduce = in_turn
+    run_script(dqn_atari_parallel, args, turns if ranks == 1 else None, **flags)
 
 
 def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1) -> None:
@@ -117,7 +125,7 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
     from stable_baselines3 import DQN
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_atari_env
-    from stable_baselines3.common.vec_env import VecFrameStack
+    from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
 
     class Clock(BaseCallback):
         def _on_step(self) -> bool:
@@ -126,7 +134,8 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
 
     gym.register_envs(ale_py)
     same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
-    env = make_atari_env(args.env_id, n_envs=envs, seed=1, env_kwargs=same_game)
+    env = make_atari_env(args.env_id, n_envs=envs, seed=1, env_kwargs=same_game,
+                         vec_env_cls=SubprocVecEnv if envs > 1 else None)
     frames = WARM_UP + args.frames
     model = DQN("CnnPolicy", VecFrameStack(env, n_stack=4), learning_rate=1e-4, buffer_size=frames,
                 learning_starts=FILLED, batch_size=32, target_update_interval=1000,

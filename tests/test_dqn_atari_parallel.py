@@ -23,7 +23,8 @@ from gymnasium.wrappers import TimeLimit
 PYTHON = sys.executable, ALGORITHMS / "dqn_atari_parallel.py"
 SHORT = dict(device="cpu", env_id="BreakoutNoFrameskip-v4", agent_replay_buffer_initial=100,
              agent_replay_buffer_maximum_length=2000, optimizer_minibatch_size=8,
-             agent_update_frequency=4, environment_test_frames=20)
+             agent_update_frequency=4, environment_test_frames=20,
+             environment_evaluation_interval_episodes=5)
 make_simulator = parallel.make_simulator
 
 
@@ -88,8 +89,7 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     assert len({str(rng.bit_generator.state) for rng in run.no_op_rngs}) == simulators
     ends = []
     for i, rng in enumerate(run.no_op_rngs):
-        env = serial.make_env(serial.Args(**SHORT), rng, training=True)
-        env = serial.FrameHistory(capped(env), 4)
+        env = serial.FrameHistory(capped(serial.make_env(serial.Args(**SHORT), rng, True)), 4)
         state, _ = env.reset(seed=1 + i)
         for j in range(i, len(s), simulators):
             assert torch.equal(s[j], run.memory.decode([state])[0]), (i, j)
@@ -100,7 +100,8 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
                 ends.append("cap" if truncated else "game" if "episode" in info else "life")
                 state, _ = env.reset()
     assert set(ends) == {"life", "game", "cap"}, ends
-    assert (run.memory.added, run.result["episodes"]) == (len(s), len(ends))
+    rows = next(tmp_path.glob("*/evaluations.csv")).read_text().count("\n") - 1
+    assert (run.memory.added, run.result["episodes"], rows) == (len(s), len(ends), len(ends) // 5)
 
 
 def test_batch_of_actions_is_greedy_for_each_state():
@@ -146,9 +147,8 @@ def watched(q_network, target_network, optimizer, minibatch, *rest):
                  "target": [x.clone() for x in target_network.parameters()]})
     result = update(q_network, target_network, optimizer, minibatch, *rest)
     seen[-1]["gradient"] = [x.grad.clone() for x in q_network.parameters()]
-    path = parallel.Path(f"rank{os.environ['RANK']}")
     if len(seen) == 8:
-        parallel.write_file(path, lambda path: torch.save(seen, path))
+        parallel.write_file(parallel.Path(f"log{os.getenv('RANK')}"), lambda p: torch.save(seen, p))
     return result
 if __name__ == "__main__":
     parallel.update = watched
@@ -202,7 +202,7 @@ def two_ranks(tmp_path_factory):
     (folder / "rank.py").write_text(RANK, encoding="utf-8")
     torchrun = Path(sys.executable).with_name("torchrun"), "--nproc-per-node", 2
     run = Command(folder, *torchrun, folder / "rank.py", ALGORITHMS)
-    run_dir, files = run.run_dir(), [folder / "rank0", folder / "rank1"]
+    run_dir, files = run.run_dir(), [folder / "log0", folder / "log1"]
     wait_until(lambda: all(map(Path.exists, files)))
     ranks = [torch.load(file, weights_only=True) for file in files]
     os.kill(ranks[1][0]["pid"], signal.SIGKILL)
@@ -236,7 +236,7 @@ def test_killed_rank_ends_the_run(two_ranks):
 def test_killed_simulator_ends_the_run(tmp_path):
     run = Command(tmp_path, *PYTHON)
     run_dir = run.run_dir()
-    os.kill([pid for pid in run.processes() if os.getsid(pid) == pid][1], signal.SIGKILL)
+    os.kill(next(pid for pid in run.processes() if os.sched_getscheduler(pid)), signal.SIGKILL)
     code, _, errors = run.end()
     assert code == 1 and "error: a process of the run" in errors and "Traceback" not in errors
     assert read_checkpoint(run_dir)["counters"]["frames"] > 0
