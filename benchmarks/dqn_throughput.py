@@ -120,8 +120,6 @@ def ours_parallel(args: Args, turns: Turns | None, ranks: int, rank: int = 0, **
 
 def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1) -> None:
     """Run its DQN; a call of its callback is a frame of each environment."""
-    import ale_py
-    import gymnasium as gym
     from stable_baselines3 import DQN
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_atari_env
@@ -132,10 +130,9 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
             turns.step(envs)
             return True
 
-    gym.register_envs(ale_py)
     same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
-    env = make_atari_env(args.env_id, n_envs=envs, seed=1, env_kwargs=same_game,
-                         vec_env_cls=SubprocVecEnv if envs > 1 else None)
+    env = make_atari_env(f"ale_py:{args.env_id}", n_envs=envs, seed=1, env_kwargs=same_game,
+                         vec_env_cls=SubprocVecEnv if envs > 1 else None)  # ale_py is imported
     frames = WARM_UP + args.frames
     model = DQN("CnnPolicy", VecFrameStack(env, n_stack=4), learning_rate=1e-4, buffer_size=frames,
                 learning_starts=FILLED, batch_size=32, target_update_interval=1000,
