@@ -8,8 +8,8 @@
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
 epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a run, checksums,
-RMSProp, --threads, the choice of the precision, dead units, charts/epsilon, and of test.json all
-but the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
+RMSProp, --threads, the choice of the precision, all curves but those of games, and of test.json
+all but the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
                                                           each
@@ -49,7 +49,6 @@ start anew. On several machines, all must see runs/RUN.
 import contextlib
 import copy
 import dataclasses
-import datetime
 import functools
 import json
 import math
@@ -77,8 +76,6 @@ from torch import distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
-
-REPORT_INTERVAL = 2_000  # frames between two points of a curve
 
 # ---- Args ----------------------------------------------------------------------------------------
 
@@ -574,7 +571,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
-    loss = q = torch.zeros(())  # until the first update
+    loss = torch.zeros(())  # until the first update
 
     def save() -> None:
         """Of rank 0: q_network.pt, what it takes to play, and checkpoint.pt, to learn on."""
@@ -610,7 +607,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         if replay.added * ranks >= args.agent_replay_buffer_initial:
             for _ in range(passed(counters.frames, step, args.agent_update_frequency)):
                 minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
-                loss, q = update(shared_network, target_network, optimizer, minibatch,
+                loss, _ = update(shared_network, target_network, optimizer, minibatch,
                                  args.agent_discount_factor, args.precision)
                 counters.updates += 1
 
@@ -654,18 +651,12 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
             table = pd.DataFrame(counters.evaluations).set_index("frames")
             write_file(run_dir / "evaluations.csv", table.to_csv)
             mean = counters.evaluations[-1]["score_mean"]
-            writer.add_scalar("evaluation/score_mean", mean, counters.frames)
             tqdm.write(f"frame {counters.frames:,}, update {counters.updates:,}: score {mean}")
 
         bar.update(step)
         counters.seconds = time.monotonic() - started
-        if passed(counters.frames, step, REPORT_INTERVAL):
-            writer.add_scalar("charts/SPS", bar.format_dict["rate"] or 0, counters.frames)
-            writer.add_scalar("losses/td_loss", loss, counters.frames)  # of rank 0's share of ℬ
-            writer.add_scalar("losses/q_values", q.mean(), counters.frames)
-        late = time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes
-        interval = args.environment_checkpoint_interval_episodes
-        if late or passed(counters.episodes, ends, interval):
+        due = passed(counters.episodes, ends, args.environment_checkpoint_interval_episodes)
+        if due or time.monotonic() - save_time > 60 * args.checkpoint_interval_minutes:
             save()
             save_time = time.monotonic()
 
@@ -676,9 +667,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         print(f"frame {counters.frames:,}; to go on: --resume {run_dir}")
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
-    if stopping and not signals:
-        signals.append(signal.SIGTERM)  # another rank's
-    if rank == 0 and not signals:
+    if rank == 0 and not (stopping or signals):
         finished = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
@@ -688,8 +677,8 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         # torchrun kills the rest.
         distributed.barrier()
         distributed.destroy_process_group()
-    if signals:
-        raise SystemExit(128 + signals[0])  # the shell's code for a signal
+    if stopping or signals:  # the shell's code for a signal, if it was another rank's, SIGTERM
+        raise SystemExit(128 + max(signals, default=signal.SIGTERM))
 
 
 def main(args: Args) -> None:
@@ -701,9 +690,8 @@ def main(args: Args) -> None:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
-    if ranks > 1:  # gloo for CPUs, NCCL for GPUs; the others wait while rank 0 evaluates
-        backend = "cpu:gloo,cuda:nccl" if args.device == "cuda" else "gloo"
-        distributed.init_process_group(backend, timeout=datetime.timedelta(days=1))
+    if ranks > 1:  # gloo for CPUs, NCCL for GPUs: they wait 30 and 10 minutes for an evaluation
+        distributed.init_process_group("cpu:gloo,cuda:nccl" if args.device == "cuda" else "gloo")
 
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]

@@ -123,7 +123,7 @@ def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency):
               environment_train_frames_max=240,
               optimizer_q_network_parameter_update_interval_frames=50)
     frames = range(simulators, 240 + simulators, simulators)
-    first = min(n for n in frames if n >= 100) // frequency  # multiple: no update
+    first = min(n for n in frames if n >= 100) // frequency  # it has no update yet
     assert run.steps == [(simulators, n, max(0, n // frequency - first)) for n in frames]
     assert (run.result["frames"], run.result["updates"]) == (240, len(run.updates))
     assert run.epsilon_frames == [n - simulators for n in frames]
