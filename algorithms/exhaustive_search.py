@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "gymnasium>=1.0", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+#     "gymnasium>=1.3", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
 # ]
 # ///
 """Exhaustive search: the best policy, by evaluating every one (§4.2, Algorithm 2).
@@ -40,14 +40,15 @@ from tqdm import tqdm, trange
 
 @dataclass
 class Args:
-    """An iteration is a sweep over a policy's states. V is a sum of rewards, in their unit."""
+    """A sweep is over a policy's states. V is a sum of rewards, in their unit. The iterations in
+    the report are policies."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=False" """
+    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     max_policies: int = 10_000
@@ -194,7 +195,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
+        model, env = (json.loads(args.model.read_bytes()) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -220,7 +221,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
+                    if [True, False].index(terminated):  # False: it goes on; neither: an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "gymnasium>=1.0", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+#     "gymnasium>=1.3", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
 # ]
 # ///
 """Policy evaluation: the value of a policy of a known Markov decision process (§3, Algorithm 1).
@@ -42,25 +42,25 @@ from tqdm import trange
 
 @dataclass
 class Args:
-    """A sweep is over all states. V is a sum of rewards, in their unit."""
+    """A sweep is over the states that the policy reaches. V is a sum of rewards, in their unit."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=False" """
+    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     policy: str = ""
-    """such as "s0=a2 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
+    """such as "s0=a1 s1=a1"; else π1, π2 and π3 of the lecture, or the first action everywhere"""
     tolerance: float = 1e-12
     """V has converged when no V(s) changes by more than this in a sweep (relative to |V(s)|, if
     above 1); the error of V may be larger"""
     max_iterations: int = 100_000
     """sweeps after which to give up"""
     output_json: Path | None = None
-    """write values, action values and policy to this file (π3's, without --policy)"""
+    """write values, action values and policy to this file (of Figure 5, without --policy: π3's)"""
 
 
 # ---- problem: a known Markov decision process ----------------------------------------------------
@@ -175,7 +175,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
+        model, env = (json.loads(args.model.read_bytes()) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -201,7 +201,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
+                    if [True, False].index(terminated):  # False: it goes on; neither: an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "gymnasium>=1.0", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
+#     "gymnasium>=1.3", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tqdm>=4.66", "tyro>=0.9",
 # ]
 # ///
 """Policy iteration: evaluate, improve, repeat (§4.4, Algorithm 4).
@@ -17,9 +17,11 @@ Measured
     tables print the second twice, as the lecture's do.
 
 Deviations
-    An action is changed only for a gain of more than 1e-9 (relative to |V(s)|, if above 1): of
-    actions that tie, an argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed
-    as the Bellman residual.
+    An action is changed only for a gain of more than 1e-9 · (1 + |V(s)|): of actions that tie, an
+    argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed as the Bellman
+    residual.
+    At discount 1 an action with which the agent can stay idle for ever has a Q of 0 at least: with
+    V = -9 to go to itself for nothing has Q = 0 + V = -9, and would only tie.
     The first policy is not random. At discount 1 a policy that collects for ever has no value, so
     the first one ends, or stays somewhere for nothing; at another discount it is the first action.
     The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
@@ -48,13 +50,13 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=False" """
+    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     initial_policy: str = ""
-    """such as "s0=a2 s1=a1 s2=a1", the lecture's π2; else one that ends if it can"""
+    """such as "s0=a2 s1=a1 s2=a1", §4.4's π2; else, at discount 1, one that ends or is idle"""
     max_iterations: int = 1000
     """policies after which to give up"""
     output_json: Path | None = None
@@ -105,6 +107,8 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
         live, V = live_states(P_π, R_π, discount), np.zeros(len(policy))  # (S,), (S,)
         V[live] = solve_system(P_π[live][:, live], R_π[live], discount)
         Q = backup(P, R, V, discount)  # (A, S)
+        if discount == 1:  # to be idle for ever is worth 0, also where Q, from V(s) < 0, is not
+            Q = np.where(idle_actions(P, R), np.maximum(Q, 0), Q)  # (A, S)
         steps.append((policy, V, Q))
         # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
         gain = ~np.isclose(Q[policy, states], Q.max(axis=0), rtol=1e-9, atol=1e-9)  # (S,)
@@ -175,7 +179,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
         # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # What is soon, a second MDP tells, solved by value iteration. It has the best actions alone and
+    # Which of them ends soonest? A second MDP tells. It has the best actions alone and
     # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
@@ -210,7 +214,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
+        model, env = (json.loads(args.model.read_bytes()) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -236,7 +240,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
+                    if [True, False].index(terminated):  # False: it goes on; neither: an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#   "numpy>=2.0", "gymnasium>=1.0", "torch>=2.4", "tensorboard>=2.17", "tyro>=0.9", "tqdm>=4.66",
+#   "numpy>=2.0", "gymnasium>=1.3", "torch>=2.4", "tensorboard>=2.17", "tyro>=0.9", "tqdm>=4.66",
 #   "matplotlib>=3.9",
 # ]
 # ///
@@ -79,7 +79,7 @@ class Args:
     env_id: str = "GridWorld"
     """or a Gymnasium environment with Discrete observations and actions"""
     env_kwargs: str = ""
-    """that environment's arguments, as in "map_name=8x8 is_slippery=False" """
+    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
 
     seed: int = 0
     """seed of the environment's and of the exploration's random generators"""

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#     "gymnasium>=1.0", "matplotlib>=3.9", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14",
+#     "gymnasium>=1.3", "matplotlib>=3.9", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14",
 #     "tqdm>=4.66", "tyro>=0.9",
 # ]
 # ///
@@ -52,9 +52,9 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=False" """
+    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     tolerance: float = 1e-12
@@ -133,7 +133,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
         # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # What is soon, a second MDP tells, solved by value iteration. It has the best actions alone and
+    # Which of them ends soonest? A second MDP tells. It has the best actions alone and
     # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
@@ -157,7 +157,7 @@ def read_model(args: Args) -> tuple[dict, gym.Env | None, sparse.csr_array, np.n
     if not 0 <= args.discount <= 1:
         raise SystemExit(f"error: --discount {args.discount} is not in [0, 1]")
     try:
-        model, env = (json.loads(args.model.read_text("utf-8")) if args.model else FIGURE_5), None
+        model, env = (json.loads(args.model.read_bytes()) if args.model else FIGURE_5), None
         if args.env_id:
             items = (item.split("=") for item in args.env_kwargs.split())
             kwargs = {k: {"true": True, "false": False}.get(v.lower(), v) for k, v in items}
@@ -183,7 +183,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if 1 - terminated:  # 1 - "false", a text, is an error; "false" alone is true
+                    if [True, False].index(terminated):  # False: it goes on; neither: an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -1,7 +1,7 @@
 # /// script
 # requires-python = ">=3.10"
 # dependencies = [
-#   "numpy>=2.0", "gymnasium>=1.0", "torch>=2.4", "tensorboard>=2.17", "tyro>=0.9", "tqdm>=4.66",
+#   "numpy>=2.0", "gymnasium>=1.3", "torch>=2.4", "tensorboard>=2.17", "tyro>=0.9", "tqdm>=4.66",
 #   "matplotlib>=3.9",
 # ]
 # ///
@@ -71,7 +71,8 @@ class Args:
     """start each episode in a random cell; if not, in (1,1)"""
 
     slip_probability: float = 0.2
-    """chance that a move slips, half to each side (0: Figure 3, left)"""
+    """chance that a move slips, half to each side (0: Figure 3, left; in (3,2) the default policy
+    then walks into the wall for ever, which has no value at discount 1)"""
     step_reward: float = -0.025
     """reward of every step that does not end the episode"""
 
@@ -203,7 +204,7 @@ def exact_values(world: GridWorld, policy: dict[int, int], discount: float) -> n
     for _ in world.cells:
         ends |= P @ ends > 1e-9  # or a step later; the longest way has as many steps as cells
     if discount == 1 and not ends.all():
-        raise SystemExit("error: from some cell the policy never ends: no finite V at discount 1")
+        raise SystemExit("error: at discount 1 the policy has no value: it may never end")
     # V^π(s) = Σ_s' P(s'|s,π(s)) [R(s,π(s),s') + γ V^π(s')], that is (I - γP) V = R    Equations 2-3
     return np.linalg.solve(np.eye(11) - discount * P, R)
 
@@ -228,7 +229,7 @@ def grid_text(world: GridWorld, contents: dict) -> str:
 
 def draw_values(axes: Axes, world: GridWorld, V: np.ndarray, policy: dict, title: str) -> None:
     """V (S,) as colours and numbers, and the policy {s: a} as arrows."""
-    scale = 3.2 * max(1, np.abs(V).max())  # 3.2: colours stay pale enough for black text
+    scale = 3.2 * max(1, np.nanmax(np.abs(V)))  # 3.2: colours stay pale enough for black text
     for s, (x, y) in enumerate(world.cells):
         if s in policy:
             value, text = V[s], "←↑→↓"[policy[s]]
@@ -266,18 +267,18 @@ def main() -> None:
                 writer.add_scalar("max |V - V^pi|", error, episode)
                 curve.append((episode, error))
 
-    contents, result = {}, {}
+    V, contents, result = np.where(N, V, np.nan), {}, {}  # V: (S,), NaN of cells never visited
     for s, a in policy.items():
-        cell, learnt = world.cells[s], V[s] if N[s] else None
-        contents[cell] = ["←↑→↓"[a], f"V   {V[s]:7.3f}", f"V^π {V_pi[s]:7.3f}"]
-        result[str(cell)] = {"action": world.actions[a], "V": learnt, "V^π": V_pi[s]}
+        contents[world.cells[s]] = ["←↑→↓"[a], f"V   {V[s]:7.3f}", f"V^π {V_pi[s]:7.3f}"]
+        learnt = {"V": V[s] if N[s] else None, "V^π": V_pi[s]}
+        result[str(world.cells[s])] = {"action": world.actions[a], **learnt}
     print(f"V after {sum(N):,} steps, V^π by the linear system:\n{grid_text(world, contents)}\n")
     print(f"max |V - V^π| = {error:.4f} in the {np.count_nonzero(N)} cells visited")
     (run_dir / "values.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
 
     figure = Figure(figsize=(18, 4.7), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    draw_values(left, world, np.array(V), policy, "V as learnt")
+    draw_values(left, world, V, policy, "V as learnt")
     draw_values(middle, world, V_pi, policy, "V^π from the linear system")
     right.plot(*zip(*curve, strict=True))
     right.set(xlabel="episode", ylabel="max |V - V^π|", title="Along training")

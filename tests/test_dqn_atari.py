@@ -1,5 +1,4 @@
-"""dqn_atari.py: what silently breaks in DQN code, each against an oracle that shares nothing with
-the script."""
+"""dqn_atari.py: what silently breaks in DQN code, against oracles that share nothing with it."""
 
 import copy
 import csv
@@ -58,8 +57,7 @@ def games_of_800(monkeypatch):
 
 @pytest.fixture
 def train(tmp_path, monkeypatch):
-    """Run main in this process; returns the run directory, the replay memory, one record for each
-    update, and the frames at which θ was copied to the target network."""
+    """Run main here: its run directory, replay memory, updates, and frames of target copies."""
 
     def run(**flags):
         memories, updates, copies = [], [], []

@@ -23,8 +23,7 @@ SHORT = {
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Run a script's main in this process; returns the run directory and the arguments of every
-    update."""
+    """Run a script's main in this process: its run directory, every update's arguments."""
 
     def call(script, **flags) -> tuple[Path, list]:
         calls, update = [], script.update

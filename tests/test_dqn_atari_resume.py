@@ -1,5 +1,4 @@
-"""dqn_atari.py survives: stopping and resuming is never having stopped, and no crash, full disk or
-bad file loses or harms anything."""
+"""dqn_atari.py: a resumed run is the one that never stopped; no crash or bad file does harm."""
 
 import copy
 import gc

@@ -57,8 +57,8 @@ class TestPolicies:
         refused(script, tmp_path, **dear)
 
     def test_from_the_starts_of_gymnasium(self, tmp_path):
-        values = run(script, tmp_path, env_id="Taxi-v4", discount=0.9)["values"]  # south for ever
-        assert values["0"] is None and values["1"] == pytest.approx(-10)  # 0 is no start
+        values = run(script, tmp_path, env_id="Taxi-v4", discount=0.9)["values"]  # 0 is no start
+        assert values["0"] is None and values["1"] == pytest.approx(-10)  # south for ever
 
     @pytest.mark.parametrize("settings", [
         {"policy": "s0=a1 s1=a1 s2=a9"}, {"policy": "s0=a2 s1=a1"}, {"max_iterations": 2},
@@ -73,7 +73,7 @@ class TestEveryScript:
     @pytest.mark.parametrize("transitions", [
         [go("goal", 1, 0.9)], [go("goal", 1, 1.5), go("goal", 1, -0.5)], [go("nowhere")],
         [go("goal", float("nan"))], [go("goal", float("inf"))], [go("goal", 10**400)],
-        [[1, "s", 0, "false"]], [go("goal", [1])],
+        [[1, "s", 0, "false"]], [[1, "s", 0, 2]], [go("goal", [1])],
         [go("goal", 1, float("nan")), go("goal")], [go("goal", 1, "1")], [go("goal")[:3]], [], 7])
     def test_bad_models(self, script, transitions, tmp_path):  # fmt: skip
         model = {"s": {"a": [go("goal")]}, "here": {"this": transitions}}
@@ -85,7 +85,8 @@ class TestEveryScript:
 
     def test_no_model(self, script, tmp_path):
         refused(script, tmp_path, {"s": {"a": [go("here")]}, "here": {}})
-        found = run(script, tmp_path, {"s": {"a": [go("goal")]}, "goal": {}})  # the lecture's s_G
+        text = '\ufeff{"s": {"a": [[1, "goal", 0, true]]}, "goal": {}}'  # \ufeff: from Windows
+        found = run(script, tmp_path, text)  # "goal": the lecture's s_G
         assert found["values"] == {"s": 0}
         for text in ("", "{}", "[]", "[" * 100_000, '{"s": 3}'):
             refused(script, tmp_path, text)

@@ -23,6 +23,8 @@ def test_first_policies(tmp_path):
     model = {"s": {"stay": [go("s", -1)], "out": [go("goal", -9)]}}
     refused(script, tmp_path, model, initial_policy="s=stay")
     assert run(script, tmp_path, model)["values"] == {"s": -9}  # it begins with one that ends
+    model["s"]["idle"] = [go("s")]  # worth 0, though from "out" it only ties: Q = 0 + V(s) = -9
+    assert run(script, tmp_path, model, initial_policy="s=out")["values"] == {"s": 0}
 
 
 @pytest.mark.parametrize("gain", [0, 1e-16, 1.5e-9, 1e-8])

@@ -1,5 +1,4 @@
-"""What holds across the scripts: each stands alone, says the same thing in the same words, and
-installs as it says."""
+"""What holds across the scripts: each stands alone, in the same words, and installs as it says."""
 
 import ast
 import itertools
