@@ -64,7 +64,7 @@ REPORT_INTERVAL = 2_000  # frames between two points of a curve
 @dataclasses.dataclass
 class Args:
     """A FRAME is what the agent observes: one action, 4 emulator frames. Counts are in frames
-    unless a flag says otherwise. An EPISODE is a life while training; a GAME ends with the last."""
+    unless a flag says otherwise. An EPISODE is a life while training, a GAME ends with the last."""
 
     # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
@@ -92,7 +92,7 @@ class Args:
     agent_update_frequency: int = 1
     """actions from one update to the next [8: 4]"""
     agent_discount_factor: float = 0.99
-    """γ of a frame"""
+    """γ, per frame"""
     agent_epsilon_greedy_epsilon_initial: float = 1.0
     """ε, probability of a random action, at frame 0"""
     agent_epsilon_greedy_epsilon_final: float = 0.01
@@ -126,7 +126,7 @@ class Args:
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
-    """frames of the final test, and the limit of an evaluation [§7.3.3]"""
+    """frames of the final test [§7.3.3], and the limit of an evaluation"""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """of the network; auto is CUDA if there is one, else the CPU"""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -151,12 +151,12 @@ def read_args() -> Args:
         except (OSError, ValueError, TypeError) as error:  # a TypeError: another script's flags
             raise SystemExit(f"error: {args.resume} is no run to resume: {error}") from None
         # Once more, with the run's own flags as defaults: whatever differs now was typed. It can
-        # be a larger number of frames (a smaller one is not the maximum), nothing else.
+        # be a number of frames that is larger (a smaller one differs from `frames`), nothing else.
         args = tyro.cli(Args, default=defaults)
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
-    # ε and γ are in [0, 1], three more may be 0, all others are larger; NaN is refused, too.
+    # ε and γ are in [0, 1], three more may be 0, all others are above 0; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
@@ -272,7 +272,7 @@ class FrameHistory(gym.Wrapper):
 
 def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.Env:
     """The game with the transformations of Figure 16 (training) or 17 (evaluation: no clipping,
-    no LifeLoss).
+    no LifeLoss); FrameHistory comes on top.
 
     Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
     Exits with one line for a name that is no Atari game.
@@ -288,10 +288,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     no_ops = args.environment_no_op_max if "NOOP" in env.meanings else 0  # a few games lack it
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
-    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (args.environment_state_width, args.environment_state_height)
-    pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84)
-    # The last argument declares the space of the result, for whoever asks; None leaves it.
+    pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84), the space of the result
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -307,7 +306,7 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 class ReplayMemory:
     """𝒟: the last `capacity` transitions (§5.3). Each has references to its own 5 frames (s' is s
     moved on by one), an action, a clipped reward, and whether s' is terminal. Arrays are made when
-    a minibatch is drawn (§7.3.2)."""
+    a minibatch is drawn (§7.3.2). `shape` is that of a state, (4, 84, 84)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -337,7 +336,7 @@ class ReplayMemory:
         """B histories of LZ4 frames, stacked: states (B, 4, 84, 84) uint8 on the device."""
         # The first frames of all histories are joined to one tall picture (B·84, 84), the second
         # ones to another, and so on. cv2.merge makes these 4 pictures the channels of a single one:
-        # the 4 values of a pixel lie side by side in memory, as convolutions read them.
+        # the 4 values of a pixel lie side by side (channels_last), as convolutions read them.
         joined = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
         tall = [np.frombuffer(pixels, np.uint8).reshape(-1, self.shape[2]) for pixels in joined]
         states = cv2.merge(tall).reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
@@ -376,7 +375,7 @@ class QNetwork(nn.Module):
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # of the screen: 84 -> 20 -> 9 -> 7
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # one side: 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(
             nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
@@ -388,7 +387,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        # `update` may have switched the layers to bfloat16 by autocast; Q stays float32.
+        # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
 
@@ -415,7 +414,7 @@ def epsilon_at(frame: int, args: Args) -> float:
 
 @torch.inference_mode()
 def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
-    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35, line 9); `state`
+    """A random action with probability ε, else argmax_a Q(s, a; θ) (Equation 35; line 9); `state`
     is (1, 4, 84, 84) uint8."""
     if rng.random() < epsilon:
         return int(rng.integers(q_network.head.out_features))
@@ -437,8 +436,8 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
             y = r + discount * ~terminal * target_network(s_next).amax(dim=1)  # (B,)
 
     # Σ_j huber(Q(s_j, a_j; θ) - y_j): its gradient in Q is the error clipped to [-1, 1]. A sum, as
-    # in Algorithm 6. A mean makes the gradient 32 times smaller: Adam's steps stay the same, but it
-    # is too small beside the 0.01 that the RMSProp of [8] adds to a variance.
+    # in Algorithm 6. A mean makes the gradient 32 times smaller: to Adam it is nearly the same, but
+    # beside the 0.01 that the RMSProp of [8] adds to a variance it would be too small.
     # Easy to get wrong: a (B,) minus a (B, 1) is a (B, B), which pulls every Q to all B targets.
     assert q.shape == y.shape == r.shape
     loss = nn.functional.huber_loss(q, y, reduction="sum")  # ()
@@ -533,12 +532,12 @@ def max_q_mean(q_network: QNetwork, states: torch.Tensor) -> float:
 
 
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
-    """Play whole games at ε_evaluation, for raw reward. Evaluations number 1, 2, … are of
-    `environment_evaluation_episodes` games, if these end within `environment_test_frames` frames;
-    number 0 is the final test, of as many games as end within them. Seed and number alone decide
-    all that is random. Returns (score, length in frames) of every game that has ended."""
+    """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
+    frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
+    the final test, does not. Seed and number alone decide all that is random. Returns (score,
+    length in frames) of every game that has ended."""
     games = args.environment_evaluation_episodes if number else math.inf
-    # main's generators are made from [seed, 0], the test's from [seed, 1], then the evaluations'.
+    # main's generators are made from [seed, 0], the test's from [seed, 1], these from what follows.
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -572,7 +571,7 @@ class Counters:
 
 def summary(counters, finished: list[tuple[float, int]]) -> dict:
     """A row of evaluations.csv: mean and sample variance of the games' scores and lengths, the
-    columns of Tables 4 to 6; NaN of no game, variance 0 of one."""
+    columns of Tables 4 to 6; NaN for no game, variance 0 for one."""
     row = {"frames": counters.frames, "updates": counters.updates, "episodes": counters.episodes}
     for i, name in enumerate(("score", "length")):
         values = [game[i] for game in finished] or [math.nan]
@@ -600,7 +599,7 @@ def write_test(path: Path, counters: Counters, finished: list) -> None:
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
     one, never a part. Exits with one line if the disk refuses."""
-    temporary = path.absolute().with_name(path.name + ".tmp")
+    temporary = path.absolute().with_name(path.name + ".tmp")  # absolute: pandas expands a ~
     try:
         write(temporary)
         temporary.replace(path)
@@ -633,8 +632,8 @@ def restore_environment(env: gym.Env, saved: dict) -> None:
 
 
 def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generator]) -> Counters:
-    """Put everything where the checkpoint was taken. weights_only, as a pickle can run a program.
-    Exits with one line if the file is not whole, or not of this run."""
+    """Put everything back to where the checkpoint was taken. weights_only, as a pickle can run a
+    program. Exits with one line if the file is not whole, or not of this run."""
     try:
         if zipfile.ZipFile(path).testzip():
             raise ValueError("a checksum is wrong")
@@ -667,7 +666,7 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 
 
 def main(args: Args) -> None:
-    """Algorithm 6, between what it needs and what it leaves behind."""
+    """Algorithm 6 (its line numbers head the comments), and what it needs and leaves behind."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
     # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
     # PyTorch's threads, too, which are started later.
@@ -682,7 +681,6 @@ def main(args: Args) -> None:
     # 1  Initialize the Atari 2600 simulator.
     env = FrameHistory(make_env(args, no_op_rng, training=True), args.agent_history_length)
     actions = env.get_wrapper_attr("meanings")
-    run_dir, _lock = open_run(args, Path(__file__).stem)  # locked for as long as there is _lock
     if args.precision == "auto":
         args.precision = choose_precision(args)
     # 2  Initialize 𝒟.
@@ -703,6 +701,7 @@ def main(args: Args) -> None:
     counters = Counters()
     s, _ = env.reset(seed=args.seed)
 
+    run_dir, _lock = open_run(args, Path(__file__).stem)  # locked for as long as there is _lock
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer,
              "replay": replay}
     if args.resume:
@@ -713,7 +712,7 @@ def main(args: Args) -> None:
     # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
-    print(f"Learning starts, and slows it down, at frame {args.agent_replay_buffer_initial:,}.")
+    print(f"Frames are slower once learning starts, at {args.agent_replay_buffer_initial:,}.")
     loss = q = torch.zeros(())  # until the first update
 
     def save_q_network() -> None:
@@ -744,10 +743,9 @@ def main(args: Args) -> None:
 
     # 8, 30  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max and not stop:
-        counters.frames += 1  # the number of the frame that is played now
-
         # 9-13  Perform an ε-greedy action, π(s) = argmax_a Q(s, a; θ). Add (s, a, r, s') to 𝒟.
-        epsilon = epsilon_at(counters.frames - 1, args)
+        epsilon = epsilon_at(counters.frames, args)
+        counters.frames += 1  # the number of the frame that is played now
         a = epsilon_greedy(q_network, replay.decode([s]), epsilon, exploration_rng)
         s_next, r, terminated, truncated, info = env.step(a)
         replay.add(s, a, r, s_next, terminated)
@@ -756,7 +754,7 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        if "episode" in info:  # from RecordEpisodeStatistics, inside LifeLoss: a game is over
+        if "episode" in info:  # a game is over: RecordEpisodeStatistics, inside LifeLoss
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
             bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)
@@ -790,6 +788,7 @@ def main(args: Args) -> None:
             held_out_max_q = row["held_out_max_q_mean"]
             writer.add_scalar("evaluation/held_out_max_q_mean", held_out_max_q, counters.frames)
             tqdm.write(f"frame {counters.frames:,}, update {counters.updates:,}: score {mean}")
+
         if episode_ended and counters.episodes % args.environment_checkpoint_interval_episodes == 0:
             save_q_network()
 

@@ -28,7 +28,7 @@ Measured
 Deviations
     lecture                      this file                              why
     ---------------------------  -------------------------------------  --------------------------
-    moments are chosen by hand   the largest jumps, a second apart      one rule for every game
+    moments are chosen by hand   largest jumps, at least 1 s apart       one rule for every game
     curves alone                 scores and lost lives are marked       they explain the jumps
 """
 
@@ -57,7 +57,7 @@ from tqdm import tqdm
 
 FRAMES_PER_SECOND = 15  # 60 emulator frames, each action repeated 4 times
 VIDEO_SIZE = 720, 420  # the screen, 320 wide, and beside it what the agent thinks
-BARS = 440, 640  # in it, from left to right: Q of an action
+BARS = 440, 640  # x in the video from and to which bars of Q lie
 GIF_FRAMES = 180  # the beginning of the video, 12 seconds
 COLOURS = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b"  # of the actions
 PUBLISHED = Path(__file__).resolve().parent.parent / "runs" / "published"
@@ -80,7 +80,7 @@ class Args:
     seed: int = 1
     """of the random actions and of the no-operations that a game starts with"""
     video_seconds: float = 1_800.0
-    """length of episode.webm, from the start of the game; no game is longer than the default"""
+    """length of episode.webm, from the start; at action repeat 4 no game is longer"""
     output: str = ""
     """folder to write to, instead of the one beside q_network.pt"""
 
@@ -201,7 +201,7 @@ class QNetwork(nn.Module):
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
-        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # of the screen: 84 -> 20 -> 9 -> 7
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):  # one side: 84 -> 20 -> 9 -> 7
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         self.layers = nn.Sequential(
             nn.Conv2d(history_length, 32, 8, stride=4), nn.ReLU(inplace=True),  # (B, 32, 20, 20)
@@ -213,7 +213,7 @@ class QNetwork(nn.Module):
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
         x = self.layers(states / 255)  # (B, 512)
-        # `update` may have switched the layers to bfloat16 by autocast; Q stays float32.
+        # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
 
@@ -228,7 +228,7 @@ def find_q_network(args: Args) -> Path:
 
 
 def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
-    """The network, and the flags that it was trained with, with `actions`, the names of the game's.
+    """The network, and the flags that it was trained with and `actions`, the names of its actions.
     Nothing in the file is run. Exits with one line if it is not whole, or cannot play its game."""
     try:
         if zipfile.ZipFile(path).testzip():
@@ -236,11 +236,11 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         trained = types.SimpleNamespace(**content["args"], actions=content["actions"])
         no_ops, repeat = trained.environment_no_op_max, trained.agent_action_repeat
-        # A hostile file: Gymnasium would import what stands before a colon, or play for ever.
+        # A hostile file: Gymnasium would import what stands before a colon, or reset for ever.
         if ":" in trained.env_id or max(no_ops, repeat) > 10_000:
             raise ValueError("its game has a module's name, or too many no-operations or repeats")
         shape = trained.environment_state_height, trained.environment_state_width
-        with torch.device("meta"):  # shapes without memory, until they are seen to be the file's
+        with torch.device("meta"):  # shapes alone; the file's tensors come if they fit
             q_network = QNetwork(trained.agent_history_length, *shape, len(trained.actions))
         q_network.load_state_dict(content["q_network"], assign=True)
         q_network.float()  # published weights may be in half precision
@@ -290,7 +290,7 @@ def play(env: gym.Env, q_network: QNetwork, trained, epsilon: float, rng, seed: 
 
 def largest_jumps(values: np.ndarray, count: int = 3) -> list[int]:
     """The frames t, in order of time, of the `count` largest |V(s_t) - V(s_{t-1})| of values (T,).
-    They lie a second apart, or one event would fill all, and each has a frame before and after."""
+    They lie at least a second apart, for different events; each has a frame before and after."""
     changes = np.abs(np.diff(values))[:-1]  # (T - 2,): index t - 1 is the jump into frame t
     moments = []
     for t in 1 + np.argsort(-changes, kind="stable"):
@@ -306,7 +306,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # frames after a life
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # with a life less
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")

@@ -9,9 +9,11 @@
 All other flags go to algorithms/dqn_atari_ablation.py, for example --environment-train-frames-max
 500000. Seeds count from --seed up. Given again, a command skips the runs that have finished and
 resumes those that were cut off. Each arm has a folder of its own in --runs-dir. The arm that the
-three studies share, Table 3 on Breakout, runs once.
+three studies share, Table 3 on Breakout, runs once if they are run one after another. Each run
+chooses its precision; --precision float32 makes it the same for all.
 
-On a cluster the runs go side by side. --list prints one command a run, safe to give again:
+On a cluster the runs go side by side. --list prints one command a run, safe to give again when the
+runs have ended:
     python benchmarks/study.py ablation --seeds 3 --list > commands.txt
     parallel -j 4 < commands.txt
     sbatch --array=1-12 --wrap 'eval "$(sed -n ${SLURM_ARRAY_TASK_ID}p commands.txt)"'
@@ -297,16 +299,16 @@ def print_tables(tests: pd.DataFrame, markdown: bool) -> None:
 
 def draw_curves(run_dirs: list[Path], file: str) -> None:
     """A row of panels a setting and game; a colour an arm, a line a run."""
-    runs = []
+    runs = {}  # of two with the same flags and seed the newer
     for run_dir in run_dirs:
         if (run_dir / "evaluations.csv").exists():
-            label, arm, _ = identity(read_args(run_dir))
+            label, arm, _ = same = identity(read_args(run_dir))
             names = {"label": label or TABLE_3, "game": arm.game, "arm": short_name(arm)}
-            runs.append(pd.read_csv(run_dir / "evaluations.csv").assign(**names, run=str(run_dir)))
+            runs[same] = pd.read_csv(run_dir / "evaluations.csv").assign(**names, run=str(run_dir))
     panels = {"score_mean": "score, evaluation", "held_out_max_q_mean": "max Q, held-out states"}
     if not runs:
         raise SystemExit("error: no evaluations.csv to draw")
-    settings = pd.concat(runs).groupby(["label", "game"])
+    settings = pd.concat(runs.values()).groupby(["label", "game"])
     figure = Figure(figsize=(12, 4 * settings.ngroups), layout="constrained")
     grid = figure.subplots(settings.ngroups, 2, squeeze=False)
     for ((label, game), alike), axes in zip(settings, grid, strict=True):
@@ -346,9 +348,9 @@ def main() -> None:
         if flags:
             parser.error(f"unrecognized arguments: {' '.join(flags)}")
         run_dirs = run_directories(Path(options.dir))
-        print_tables(read_tests(run_dirs), options.markdown)
         if options.figure:
             draw_curves(run_dirs, options.figure)
+        print_tables(read_tests(run_dirs), options.markdown)
         return
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
