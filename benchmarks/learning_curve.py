@@ -27,7 +27,6 @@ def main(args: Args) -> None:
     events = EventAccumulator(str(args.run_dir), size_guidance={"scalars": 0}).Reload()
     points = events.Scalars("charts/episodic_return")
     games = pd.Series([p.value for p in points], index=[p.step for p in points])
-    evaluations = pd.read_csv(args.run_dir / "evaluations.csv")
     run = json.loads((args.run_dir / "args.json").read_text())
 
     figure = Figure(figsize=(8, 4.5), layout="constrained")
@@ -35,10 +34,13 @@ def main(args: Args) -> None:
     axes.plot(games.index, games, ".", color="0.8", label="training game")
     means = games.rolling(20, min_periods=1).mean()
     axes.plot(games.index, means, color="tab:blue", label="mean of the last 20 training games")
-    axes.errorbar(evaluations.frames, evaluations.score_mean, np.sqrt(evaluations.score_variance),
-                  fmt="o", markersize=4, color="tab:orange", capsize=3,
-                  label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, "
-                        "standard deviation")
+    if (args.run_dir / "evaluations.csv").exists():  # games of Enduro are long: none in time
+        evaluations = pd.read_csv(args.run_dir / "evaluations.csv")
+        axes.errorbar(evaluations.frames, evaluations.score_mean,
+                      np.sqrt(evaluations.score_variance),
+                      fmt="o", markersize=4, color="tab:orange", capsize=3,
+                      label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, "
+                            "standard deviation")
     if (args.run_dir / "test.json").exists():
         test = json.loads((args.run_dir / "test.json").read_text())
         axes.axhline(test["score_mean"], color="tab:green", linestyle="--",

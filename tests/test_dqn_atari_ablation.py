@@ -6,9 +6,11 @@ from pathlib import Path
 
 import dqn_atari
 import dqn_atari_ablation as ablation
+import dqn_atari_parallel as parallel
 import numpy as np
 import pytest
 import torch
+from test_dqn_atari import weights
 from test_suite import ALGORITHMS, definitions
 from torch import nn
 
@@ -17,8 +19,7 @@ SHORT = {
     "precision": "float32", "agent_replay_buffer_initial": 200, "agent_update_frequency": 4,
     "agent_replay_buffer_maximum_length": 300, "environment_test_frames": 300,
     "environment_evaluation_episodes": 1, "environment_evaluation_interval_episodes": 4,
-    "optimizer_q_network_parameter_update_interval_frames": 100,
-}
+    "optimizer_q_network_parameter_update_interval_frames": 100}
 
 
 @pytest.fixture
@@ -41,10 +42,6 @@ def run(tmp_path, monkeypatch):
     return call
 
 
-def weights(run_dir: Path) -> dict[str, torch.Tensor]:
-    return torch.load(run_dir / "q_network.pt", weights_only=True)["q_network"]
-
-
 def rows(run_dir: Path) -> list[dict]:
     with open(run_dir / "evaluations.csv", newline="") as file:
         return list(csv.DictReader(file))
@@ -62,30 +59,30 @@ def test_without_switches_it_is_dqn_atari(run):
 
 
 def test_diff_shows_the_switches_and_nothing_else():
-    one = definitions(ALGORITHMS / "dqn_atari.py")
-    other = definitions(ALGORITHMS / "dqn_atari_ablation.py")
-    assert set(one) - set(other) == {"initialize_orthogonal"}
-    assert set(other) - set(one) == {"initialize", "held_out_states", "max_q_mean"}
+    one, other = (set(definitions(ALGORITHMS / f"dqn_atari{end}.py")) for end in ("", "_ablation"))
+    assert one - other == {"initialize_orthogonal"}
+    assert other - one == {"initialize", "held_out_states", "max_q_mean"}
+    for Args in (ablation.Args, parallel.Args):  # first stand Table 3's
+        assert list(vars(Args()).items())[:23] == list(vars(dqn_atari.Args()).items())[:23]
 
 
 def test_without_target_network_y_comes_from_the_online_network(run):
-    _, calls = run(ablation, target_network=False)
+    _, calls = run(ablation, target_network=False, initialization="he")
     assert calls and all(q is target for q, target, _ in calls)
+    assert calls[0][0].layers[4].weight.std() > 0.05  # He's; orthogonal is 0.042
     assert all(θ.requires_grad for θ in calls[0][0].parameters())
     _, calls = run(ablation)
     assert all(q is not target for q, target, _ in calls)
 
 
 def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkeypatch):
-    stored = []
-    add = ablation.ReplayMemory.add
+    stored, stored_when, add = [], [], ablation.ReplayMemory.add
 
     def noted(self, s, a, r, s_next, terminal):
         stored.append((self.decode([s])[0], a, r, self.decode([s_next])[0], terminal))
         add(self, s, a, r, s_next, terminal)
         stored_when.append(len(stored))
 
-    stored_when = []
     monkeypatch.setattr(ablation.ReplayMemory, "add", noted)
     _, calls = run(ablation, replay_buffer=False)
     ends = [n for n in stored_when if n >= 200 and n % 4 == 0]  # past 300 the memory wraps
@@ -118,9 +115,8 @@ def test_initialization(name):
 
 def test_held_out_states_are_the_seeds_own():
     replay = ablation.ReplayMemory(1, (4, 84, 84), "cpu")
-    first, again, other = [
-        ablation.held_out_states(ablation.Args(seed=seed), replay.decode) for seed in (1, 1, 2)
-    ]
+    first, again, other = (ablation.held_out_states(ablation.Args(seed=seed), replay.decode)
+                           for seed in (1, 1, 2))
     assert first.shape == (500, 4, 84, 84) and first.dtype == torch.uint8
     assert torch.equal(first, again) and not torch.equal(first, other)
     q_network = ablation.QNetwork(4, 84, 84, 4)

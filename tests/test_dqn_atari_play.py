@@ -22,7 +22,7 @@ SEED, EPSILON, ACTIONS = 15, 0.8, ["NOOP", "FIRE", "RIGHT", "LEFT"]  # of Breako
 def episode(tmp_path_factory):
     """A game of a network that dqn_atari.py wrote, and its actions on the bare emulator."""
     runs, returned, whole = tmp_path_factory.mktemp("runs"), [], play.play
-    dqn.main(dqn.Args(env_id="BreakoutNoFrameskip-v4", environment_train_frames_max=1, threads=1,
+    dqn.main(dqn.Args(env_id="ALE/Breakout-v5", environment_train_frames_max=1, threads=1,
                       environment_test_frames=1, precision="float32", runs_dir=str(runs),
                       environment_state_height=44, environment_state_width=52))
     torch.set_flush_denormal(False)

@@ -28,8 +28,7 @@ SHORT = {
     "agent-replay-buffer-initial": 150, "agent-replay-buffer-maximum-length": 350,
     "agent-epsilon-greedy-annealing": 400, "optimizer-minibatch-size": 8,
     "optimizer-q-network-parameter-update-interval-frames": 70,
-    "checkpoint-interval-minutes": 0.00001,
-}
+    "checkpoint-interval-minutes": 0.00001}
 
 
 def run(*flags, each_frame=lambda frame: None, **changed):
@@ -99,8 +98,7 @@ def everything(run_dir: Path) -> dict:
         "replay": (replay.added, replay.frames.tolist(), replay.numbers.tobytes()), "rows": rows,
         "test": {name: test[name] for name in ("scores", "lengths", "updates")},
         "args": {name: args[name] for name in args if name != "runs_dir"},
-        "q_network.pt": plain(torch.load(run_dir / "q_network.pt", weights_only=True)["q_network"]),
-    }
+        "q_network.pt": plain(torch.load(run_dir / "q_network.pt", weights_only=True)["q_network"])}
 
 
 @pytest.fixture(scope="module")
@@ -265,8 +263,7 @@ def test_contradictions_are_refused(stopped):
     "--env-id NoSuchGame-v0", "--env-id CartPole-v1", "--env-id FrozenLake-v1", "--seed -1",
     "--agent-update-frequency -4", "--agent-replay-buffer-initial 0", "--threads -1",
     "--agent-epsilon-greedy-epsilon-final 2", "--agent-discount-factor -0.5",
-    "--optimizer-learning-rate nan", "--agent-replay-buffer-initial 351",
-])
+    "--optimizer-learning-rate nan", "--agent-replay-buffer-initial 351"])
 def test_bad_input_is_refused_in_one_line(flags, tmp_path):
     name, value = flags.split()
     code = run(**{name[2:]: value, "runs_dir": tmp_path / "runs"})

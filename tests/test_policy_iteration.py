@@ -25,6 +25,8 @@ def test_first_policies(tmp_path):
     assert run(script, tmp_path, model)["values"] == {"s": -9}  # it begins with one that ends
     model["s"]["idle"] = [go("s")]  # worth 0, though from "out" it only ties: Q = 0 + V(s) = -9
     assert run(script, tmp_path, model, initial_policy="s=out")["values"] == {"s": 0}
+    chain = {str(i): {"": [go(str(i + 1) if i < 2999 else "goal", i == 2999)]} for i in range(3000)}
+    assert run(script, tmp_path, chain)["values"]["0"] == pytest.approx(1)  # not by BiCGSTAB
 
 
 @pytest.mark.parametrize("gain", [0, 1e-16, 1.5e-9, 1e-8])

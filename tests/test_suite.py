@@ -43,8 +43,7 @@ def pinned() -> dict[str, str]:
     """requirements.txt: name and version; every line says why."""
     lines = (ROOT / "requirements.txt").read_text().splitlines()
     assert all(re.fullmatch(r"[\w.-]+==\S+ +# \S.*", line) for line in lines), lines
-    pairs = (line.split()[0].split("==") for line in lines)
-    return {name.lower(): version for name, version in pairs}
+    return {name.lower(): v for name, v in (line.split()[0].split("==") for line in lines)}
 
 
 def test_same_name_same_source():
@@ -112,6 +111,4 @@ def test_readme_commands_are_the_ones_that_ci_runs():
 
 def test_readme_pictures_are_there():
     links = re.findall(r"\]\(([^)#:]+)\)|src=\"([^\":]+)\"", README)
-    assert links
-    for link in map("".join, links):
-        assert (ROOT / link).exists(), link
+    assert links and all((ROOT / link).exists() for link in map("".join, links)), links

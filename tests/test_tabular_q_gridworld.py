@@ -139,7 +139,12 @@ class TestCommandLine:
             assert all(f"{q:.3f}" in done.stdout for q in Q.values())
         assert json.loads((run / "args.json").read_text())["episodes"] == 300
         assert (run / "figure.png").read_bytes().startswith(b"\x89PNG")
-        assert EventAccumulator(str(run)).Reload().Scalars("max |Q - Q*|")[-1].step == 300
+        error = EventAccumulator(str(run)).Reload().Scalars("max |Q - Q*|")[-1]
+        Q = np.array([[*values.values()] for values in table["action_values"].values()])  # (9, 4)
+        gap = np.abs(Q - script.optimal_action_values(GridWorld().P, 1)[ACTING]).max()
+        assert (error.step, error.value) == (300, pytest.approx(gap, rel=1e-5))
+        optimal = sum(map(str.__eq__, table["policy"].values(), FIGURE_10.values()))
+        assert 0 < optimal < 9 and f"optimal in {optimal} of 9" in done.stdout
         signs = [sign for sign in done.stdout.split("Q*")[1] if sign in "←↑→↓"]  # from the top
         assert signs == [*"→→→↑←↑←←←"]
 

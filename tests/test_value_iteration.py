@@ -38,6 +38,8 @@ def test_the_lectures_two_tables(tmp_path, capsys):
     assert result["policy"] == {"s0": "a1", "s1": "a1", "s2": "a2"} and result["iterations"] == 4
     assert result["values"] == pytest.approx({"s0": 11, "s1": 1, "s2": 4})
     refused(script, tmp_path, max_iterations=3)
+    half = {"discount": 0.5, "tolerance": 0.2}  # V: 1, 1.5, 1.75, and one more sweep gives 1.875
+    assert run(script, tmp_path, {"s": {"a": [go("s", 1)]}}, **half)["residual"] == 0.125
 
 
 @pytest.mark.parametrize("name", TRAPS)
