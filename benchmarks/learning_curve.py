@@ -50,7 +50,8 @@ def main(args: Args) -> None:
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(args.run_dir / "learning_curve.png", dpi=100)
-    print(f"wrote {args.run_dir / 'learning_curve.png'}: {len(games)} training games")
+    print(f"wrote {args.run_dir / 'learning_curve.png'}: {len(games)} training games, the last 20 "
+          f"with a mean of {means.iloc[-1]:.4g}")
 
 
 if __name__ == "__main__":
