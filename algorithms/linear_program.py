@@ -127,7 +127,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
         # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Which of them ends soonest? A second MDP tells. It has the best actions alone and
+    # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
     # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
@@ -188,7 +188,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if [True, False].index(terminated):  # False: it goes on; neither: an error
+                    if {False: True, True: False}[terminated]:  # it goes on; else an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -101,14 +101,14 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
     Exits if a policy has no value, or if π has not converged after max_iterations.
     """
     steps, states = [], np.arange(len(policy))
+    idle = idle_actions(P, R) if discount == 1 else np.zeros(R.shape, bool)  # (A, S)
     for _ in tqdm(range(max_iterations), "policy iteration", delay=2, leave=False):
         # Perform policy evaluation on π to find V^π(s)  Algorithm 4, line 3
         P_π, R_π = P[policy * len(states) + states], R[policy, states]  # (S, S), (S,)
         live, V = live_states(P_π, R_π, discount), np.zeros(len(policy))  # (S,), (S,)
         V[live] = solve_system(P_π[live][:, live], R_π[live], discount)
         Q = backup(P, R, V, discount)  # (A, S)
-        if discount == 1:  # to be idle for ever is worth 0, also where Q, from V(s) < 0, is not
-            Q = np.where(idle_actions(P, R), np.maximum(Q, 0), Q)  # (A, S)
+        Q[idle] = np.maximum(Q[idle], 0)  # to be idle for ever is worth 0, if now V(s) < 0, too
         steps.append((policy, V, Q))
         # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
         gain = ~np.isclose(Q[policy, states], Q.max(axis=0), rtol=1e-9, atol=1e-9)  # (S,)
@@ -119,7 +119,7 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
     raise SystemExit(f"error: π has not converged in {max_iterations} iterations")
 
 
-# At discount 1, `proper_policy` and `idle_actions`, below, make the first policy.
+# At discount 1, `proper_policy` and `idle_actions`, below, make the first policy, too.
 
 
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -179,7 +179,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
         # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Which of them ends soonest? A second MDP tells. It has the best actions alone and
+    # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
     # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
     ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
@@ -240,7 +240,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if [True, False].index(terminated):  # False: it goes on; neither: an error
+                    if {False: True, True: False}[terminated]:  # it goes on; else an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
