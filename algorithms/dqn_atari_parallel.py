@@ -43,7 +43,7 @@ Deviations, beside those of dqn_atari.py
 
 A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
 acts until that holds the initial number (these frames count), then learns on; its random numbers
-start anew. On several machines, all must see runs/RUN.
+start anew. On several machines, all must see runs/RUN. Ctrl-C: torchrun kills ranks after 30 s.
 """
 
 import contextlib
@@ -689,7 +689,7 @@ def main(args: Args) -> None:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
     if args.optimizer_minibatch_size % ranks:
         raise SystemExit(f"error: --optimizer-minibatch-size is not a multiple of {ranks} ranks")
-    if ranks > 1:  # gloo for CPUs, NCCL for GPUs: they wait 30 and 10 minutes for an evaluation
+    if ranks > 1:  # gloo for CPUs, NCCL for GPUs: they wait 30 minutes for an evaluation
         distributed.init_process_group("cpu:gloo,cuda:nccl" if args.device == "cuda" else "gloo")
 
     rngs = np.random.default_rng([args.seed, 0, rank]).spawn(2 + args.num_simulators)

@@ -4,12 +4,10 @@ import contextlib
 import copy
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
 import time
-import uuid
 from pathlib import Path
 
 import dqn_atari as serial
@@ -19,12 +17,14 @@ import pytest
 import torch
 from conftest import ALGORITHMS
 from gymnasium.wrappers import TimeLimit
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 PYTHON = sys.executable, ALGORITHMS / "dqn_atari_parallel.py"
 SHORT = dict(device="cpu", env_id="BreakoutNoFrameskip-v4", agent_replay_buffer_initial=100,
              agent_replay_buffer_maximum_length=2000, optimizer_minibatch_size=8,
              agent_update_frequency=4, environment_test_frames=20,
-             environment_evaluation_interval_episodes=5)
+             environment_evaluation_interval_episodes=5,
+             optimizer_q_network_parameter_update_interval_frames=10**6)
 make_simulator = parallel.make_simulator
 
 
@@ -38,10 +38,10 @@ def make_capped_simulator(*arguments):
 
 
 class Run:
-    """main() in this process: its memory, no-op generators at the start, updates and steps."""
+    """main() in this process: memory, no-op generators at the start, updates, acting, tests."""
 
     def __init__(self, folder: Path, **flags):
-        run, self.updates, self.steps, self.epsilon_frames = self, [], [], []
+        run, self.updates, self.steps, self.acted, self.evaluated = self, [], [], [], []
         make_memory, make_envs = parallel.ReplayShare, parallel.AsyncVectorEnv
 
         def memory(*arguments):
@@ -61,15 +61,25 @@ class Run:
             before = q_network.head.weight.detach().clone()
             result = serial.update(q_network, target_network, optimizer, *rest)
             run.updates.append({
-                "frames": len(run.memory), "target": target_network.head.weight.clone(),
+                "frames": len(run.memory), "s": rest[0][0],
+                "target": target_network.head.weight.clone(),
                 "before": before, "after": q_network.head.weight.detach().clone(),
                 "adam": int(next(iter(optimizer.state.values()))["step"])})
             return result
 
+        def act(q_network, states, epsilon, rng):
+            run.acted.append((q_network.head.weight.requires_grad, states, epsilon))
+            return greedy(q_network, states, epsilon, rng)
+
+        def evaluate(args, q_network, decode, number):
+            run.evaluated.append((q_network.head.weight.requires_grad, number))
+            return serial.evaluate(args, q_network, decode, number)
+
+        greedy = parallel.epsilon_greedy_batch
         with pytest.MonkeyPatch.context() as patch:
             spies = dict(ReplayShare=memory, AsyncVectorEnv=envs, tqdm=Bar, update=update,
-                         make_simulator=make_capped_simulator, epsilon_at=lambda frame, args:
-                         run.epsilon_frames.append(frame) or serial.epsilon_at(frame, args))
+                         make_simulator=make_capped_simulator, epsilon_greedy_batch=act,
+                         evaluate=evaluate)
             for name, spy in spies.items():
                 patch.setattr(parallel, name, spy)
             parallel.main(parallel.Args(**(SHORT | {"runs_dir": str(folder)} | flags)))
@@ -87,7 +97,8 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
               agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400)
     s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
     assert len({str(rng.bit_generator.state) for rng in run.no_op_rngs}) == simulators
-    ends = []
+    assert torch.equal(torch.cat([states for _, states, _ in run.acted]), s)
+    ends, games = [], []
     for i, rng in enumerate(run.no_op_rngs):
         env = serial.FrameHistory(capped(serial.make_env(serial.Args(**SHORT), rng, True)), 4)
         state, _ = env.reset(seed=1 + i)
@@ -96,21 +107,29 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
             state, reward, terminated, truncated, info = env.step(int(a[j]))
             assert torch.equal(s_next[j], run.memory.decode([state])[0]), (i, j)
             assert (float(r[j]), bool(terminal[j])) == (reward, terminated), (i, j)
+            if "episode" in info:
+                games.append((j - i + simulators, info["episode"]["r"]))
             if terminated or truncated:
                 ends.append("cap" if truncated else "game" if "episode" in info else "life")
                 state, _ = env.reset()
     assert set(ends) == {"life", "game", "cap"}, ends
     rows = next(tmp_path.glob("*/evaluations.csv")).read_text().count("\n") - 1
     assert (run.memory.added, run.result["episodes"], rows) == (len(s), len(ends), len(ends) // 5)
+    assert run.evaluated == [(True, number) for number in (*range(1, rows + 1), 0)]
+    events = EventAccumulator(str(next(tmp_path.iterdir()))).Reload()
+    found = [(event.step, event.value) for event in events.Scalars("charts/episodic_return")]
+    assert sorted(found) == sorted(games)
 
 
 def test_batch_of_actions_is_greedy_for_each_state():
     q_network = parallel.QNetwork(4, 84, 84, 6)
-    q_network.head.weight.data *= 100
     states = torch.randint(256, (5, 4, 84, 84), dtype=torch.uint8)
+    q_network.head.weight.data *= 100
+    q_network.head.bias.data -= q_network(states).mean(dim=0).detach()  # states differ in actions
     rng = np.random.default_rng(0)
     wanted = [serial.epsilon_greedy(q_network, state, 0.0, rng) for state in states.split(1)]
     assert parallel.epsilon_greedy_batch(q_network, states, 0.0, rng).tolist() == wanted
+    assert len(set(wanted)) > 1
     many = [parallel.epsilon_greedy_batch(q_network, states, 0.6, rng) for _ in range(400)]
     greedy = np.array(many) == wanted  # (400, 5)
     assert abs(greedy.mean() - (0.4 + 0.6 / 6)) < 0.04
@@ -120,13 +139,15 @@ def test_batch_of_actions_is_greedy_for_each_state():
 @pytest.mark.parametrize(("simulators", "frequency"), [(3, 4), (4, 1)])
 def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency):
     run = Run(tmp_path, num_simulators=simulators, agent_update_frequency=frequency,
-              environment_train_frames_max=240,
+              environment_train_frames_max=240, agent_replay_buffer_maximum_length=110,
               optimizer_q_network_parameter_update_interval_frames=50)
     frames = range(simulators, 240 + simulators, simulators)
     first = min(n for n in frames if n >= 100) // frequency  # it has no update yet
     assert run.steps == [(simulators, n, max(0, n // frequency - first)) for n in frames]
     assert (run.result["frames"], run.result["updates"]) == (240, len(run.updates))
-    assert run.epsilon_frames == [n - simulators for n in frames]
+    epsilons = [serial.epsilon_at(n - simulators, serial.Args()) for n in frames]
+    assert [(θ, epsilon) for θ, _, epsilon in run.acted] == [(True, x) for x in epsilons]
+    assert len({s.numpy().tobytes() for update in run.updates for s in update["s"]}) > 60
     target, done = run.updates[0]["before"], 0
     for _, n, updates in run.steps:
         for update in run.updates[done:updates]:
@@ -170,7 +191,7 @@ class Command:
     def __init__(self, folder: Path, *command):
         if not Path("/proc/self/environ").exists():
             pytest.skip("finds processes in /proc")
-        self.mark, self.folder = f"MARK={uuid.uuid4().hex}", folder
+        self.mark, self.folder = f"MARK={time.time_ns()}", folder
         flags = SHORT | dict(runs_dir="runs", checkpoint_interval_minutes=0.005, num_simulators=2)
         command = [*command, *(f"--{k.replace('_', '-')}={v}" for k, v in flags.items())]
         self.process = subprocess.Popen(
@@ -195,22 +216,24 @@ class Command:
         return self.process.returncode, output, errors
 
 
-@pytest.fixture(scope="module")
-def two_ranks(tmp_path_factory):
-    """What two ranks saw in their first updates; exit code, output, errors after one was killed."""
-    folder = tmp_path_factory.mktemp("ranks")
+def start_two_ranks(folder: Path) -> tuple[Command, Path, list, list]:
+    """A run of two ranks with a checkpoint of some updates, and what each saw in its first 8."""
     (folder / "rank.py").write_text(RANK, encoding="utf-8")
     torchrun = Path(sys.executable).with_name("torchrun"), "--nproc-per-node", 2
     run = Command(folder, *torchrun, folder / "rank.py", ALGORITHMS)
     run_dir, files = run.run_dir(), [folder / "log0", folder / "log1"]
     wait_until(lambda: all(map(Path.exists, files)))
-    ranks = [torch.load(file, weights_only=True) for file in files]
-    os.kill(ranks[1][0]["pid"], signal.SIGKILL)
-    return *ranks, *run.end(), read_checkpoint(run_dir)
+    wait_until(lambda: read_checkpoint(run_dir)["counters"]["updates"])
+    return run, run_dir, *[torch.load(file, weights_only=True) for file in files]
 
 
-def test_ranks_have_one_θ_and_the_mean_of_their_gradients(two_ranks):
-    first, second, *_ = two_ranks
+def test_ranks_have_one_θ_and_the_mean_gradient_and_one_that_is_killed_ends_both(tmp_path):
+    run, run_dir, first, second = start_two_ranks(tmp_path)
+    os.kill(second[0]["pid"], signal.SIGKILL)
+    code, _, errors = run.end()
+    assert code != 0 and "error: a process of the run has died" in errors
+    counters = read_checkpoint(run_dir)["counters"]  # totals over the ranks
+    assert counters["updates"] == (counters["frames"] - 100) // 4 > 0
     networks = [parallel.QNetwork(4, 84, 84, 4) for _ in range(2)]
     for mine, yours in zip(first, second, strict=True):
         for name in ("θ", "gradient", "target"):
@@ -227,10 +250,11 @@ def test_ranks_have_one_θ_and_the_mean_of_their_gradients(two_ranks):
             torch.testing.assert_close(gradient, parameter.grad / 2, rtol=1e-4, atol=1e-5)
 
 
-def test_killed_rank_ends_the_run(two_ranks):
-    _, _, code, _, errors, checkpoint = two_ranks
-    assert code != 0 and "error: a process of the run has died" in errors
-    assert checkpoint["counters"]["frames"] > 0
+def test_a_signal_to_one_rank_stops_both(tmp_path):
+    run, _, _, second = start_two_ranks(tmp_path)
+    os.kill(second[0]["pid"], signal.SIGTERM)
+    code, output, errors = run.end()
+    assert code != 0 and "to go on: --resume" in output and "has died" not in errors
 
 
 def test_killed_simulator_ends_the_run(tmp_path):
@@ -246,17 +270,21 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     run = Command(tmp_path, *PYTHON)
     run_dir = run.run_dir()
     wait_until(lambda: read_checkpoint(run_dir)["counters"]["updates"])
-    run.process.terminate()
+    for pid in sorted(run.processes(), reverse=True):  # Ctrl-C reaches all; here simulators first
+        os.kill(pid, signal.SIGINT)
+        time.sleep(0.2)
     code, output, _ = run.end()
-    assert code == 128 + signal.SIGTERM and not (run_dir / "test.json").exists()
+    assert code == 128 + signal.SIGINT and not (run_dir / "test.json").exists()
     saved = read_checkpoint(run_dir)
     frames, updates = saved["counters"]["frames"], saved["counters"]["updates"]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", shlex.split(output.splitlines()[-1])[4:])
-    flags = vars(parallel.read_args()) | {"environment_train_frames_max": frames + 140}
+    monkeypatch.setattr(sys, "argv", output.splitlines()[-1].split()[4:])
+    flags = vars(parallel.read_args()) | {
+        "environment_train_frames_max": frames + 140, "seed": 2}  # another θ₀
     first = Run(run_dir.parent, **flags).updates[0]
     assert first["frames"] >= 100 and first["adam"] == updates + 1
-    assert torch.equal(first["before"], saved["q_network"]["head.weight"])
+    for seen, name in (("before", "q_network"), ("target", "target_network")):
+        assert torch.equal(first[seen], saved[name]["head.weight"])
     counters = read_checkpoint(run_dir)["counters"]
     assert (counters["frames"], counters["updates"]) == (frames + 140, updates + (140 - 100) // 4)
     os.truncate(run_dir / "checkpoint.pt", 5000)

@@ -4,15 +4,12 @@ import ast
 import itertools
 import re
 import sys
-from importlib.metadata import metadata
 from pathlib import Path
 
 import pytest
+from conftest import ALGORITHMS, ROOT
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 
-ROOT = Path(__file__).parent.parent
-ALGORITHMS = ROOT / "algorithms"
 SCRIPTS = sorted(ALGORITHMS.glob("*.py"))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 OWN = {"Args", "main"}  # each script's own
@@ -91,16 +88,6 @@ class TestEveryScript:
             if isinstance(node, ast.AnnAssign):
                 assert isinstance(after, ast.Expr), ast.unparse(node)
                 assert isinstance(after.value.value, str), ast.unparse(node)
-
-    def test_readme_names_it(self, path):
-        assert f"algorithms/{path.name}" in README
-
-
-def test_readme_asks_for_a_python_that_the_pinned_packages_take():
-    (python,) = re.findall(r"Python (3\.\d+) or later", README)
-    for name in pinned():
-        wanted = SpecifierSet(metadata(name).get("Requires-Python", ""))
-        assert wanted.contains(f"{python}.0"), name
 
 
 def test_readme_commands_are_the_ones_that_ci_runs():
