@@ -43,7 +43,7 @@ Deviations, beside those of dqn_atari.py
 
 A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
 acts until that holds the initial number (these frames count), then learns on; its random numbers
-start anew. On several machines, all must see runs/RUN. Ctrl-C: torchrun kills ranks after 30 s.
+start anew. All machines must see runs/RUN. 30 s after Ctrl-C torchrun kills what still runs.
 """
 
 import contextlib

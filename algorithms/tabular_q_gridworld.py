@@ -28,7 +28,7 @@ Deviations from the lecture
                   undiscounted and with slip 0.2, exactly for step rewards from -0.0274 to -0.0221:
                   `python benchmarks/gridworld.py step-rewards` shows it.
     Convergence   --episodes of them: samples do not tell whether Q has converged.
-    α             0.7 · N(s,a)^-0.85, N(s,a) visits. Where moves slip, a constant α never settles.
+    α             0.7 · N(s,a)^-0.85, N(s,a) visits: Q settles with a constant α only without slips.
     ε             falls with each episode, from 1 to 0.7. A greedier robot hardly ever sees (4,1),
                   and Q-learning learns Q* whatever its robot does (it is off-policy).
     Discount      --discount, 1 by default as in Equation 34: other environments need one.

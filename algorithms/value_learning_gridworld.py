@@ -29,7 +29,7 @@ Measured, by the first command
 
 Deviations from the lecture
     Starts        in a random cell, by default: the policy hardly ever gets from (1,1) to (4,1).
-    α             N(s)^-0.7, N(s) visits of the cell: with a constant α, V never settles.
+    α             N(s)^-0.7, N(s) visits: V settles with a constant α only without slips.
     Discount      --discount, 1 by default as in Equation 3.
     Time limit    1,000 steps: a policy may never end.
 """

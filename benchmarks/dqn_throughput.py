@@ -23,7 +23,6 @@ import copy
 import dataclasses
 import multiprocessing
 import os
-import platform
 import queue
 import sys
 import tempfile
@@ -33,6 +32,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from machine import cpu_name
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
 TURN = 96  # frames: whole steps of 1, 2, 4 and 8 simulators
@@ -242,15 +242,6 @@ def parts(args: Args) -> dict[str, float]:
         "Adam's step when old": milliseconds(optimizer.step, 100, grow_old),
     }
     return times
-
-
-def cpu_name() -> str:
-    """The CPU's model, as far as the operating system tells."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":")[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def old_without_flushing() -> float:

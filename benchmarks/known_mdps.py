@@ -7,7 +7,7 @@
 Random MDPs from arrays: 4 actions in every state, 5 successors, discount 0.95; both get the same.
 A solve has a process of its own: its peak memory counts libraries and model. Of two solves in turns
 the quicker counts. Ratio: ours / theirs. QuantEcon's modified policy iteration, its quickest, which
-is not in the lecture, is beside our policy iteration. Linux tells the memory and the CPU's name.
+is not in the lecture, is beside our policy iteration. On Linux alone: it tells the peak memory.
 """
 
 import importlib
@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from machine import cpu_name
 from scipy import sparse
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
@@ -147,16 +148,10 @@ def in_turns(limit: float, what: str, size: int) -> list:
     return [None if None in solved else min(solved, key=lambda one: one[0][0]) for solved in found]
 
 
-def cpu() -> str:
-    """The processor's model, on Linux."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next(line.split(": ")[1] for line in lines if line.startswith("model name"))
-
-
 def main(args: Args) -> None:
     """Print one line for each measurement."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "quantecon"))
-    print(f"{cpu()}; Python {platform.python_version()}, {versions}")
+    print(f"{cpu_name()}; Python {platform.python_version()}, {versions}")
     for size in args.sizes:
         print(f"{size:,} states")
         (ours, theirs), _ = apart(None, bellman_sweeps, size, args.sweeps)
