@@ -8,6 +8,7 @@
 
 Run it
     python algorithms/exhaustive_search.py                    # the lecture's MDP has three policies
+    python algorithms/exhaustive_search.py --env-id FrozenLake-v1 --env-kwargs is_slippery=False
     python algorithms/exhaustive_search.py --model my_mdp.json --discount 0.95
 
 Measured
@@ -40,8 +41,8 @@ from tqdm import tqdm, trange
 
 @dataclass
 class Args:
-    """A sweep is over a policy's states. V is a sum of rewards, in their unit. The iterations in
-    the report are policies."""
+    """A sweep is over a policy's states. V(s) is the expected sum of rewards from state s on, in
+    their unit; π(s) the action in s. The iterations in the report are policies."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -88,11 +89,11 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 
 def policies(P: sparse.csr_array, R: np.ndarray, start: np.ndarray) -> Iterator[np.ndarray]:
     """Every policy (S,) int once: an action in each state that it reaches, -1 elsewhere."""
-    stack = [np.full(len(start), -1)]
+    stack = [np.full(len(start), -1)]  # of (S,)
     while stack:
         policy = stack.pop()
         # Actions are chosen only in states that it reaches: s0 at first, s2 only after a2 in s0.
-        decided = np.flatnonzero(policy >= 0)
+        decided = np.flatnonzero(policy >= 0)  # indices of states
         reached = (start > 0) | (P[policy[decided] * len(policy) + decided].sum(axis=0) > 0)  # (S,)
         undecided = np.flatnonzero(reached & (policy < 0))
         if len(undecided) == 0:
@@ -112,7 +113,7 @@ def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndar
     P_π, R_π = P[rows][:, states], R[policy[states], states]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
     V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
-    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]
+    states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]  # (m,), (m, m), (m,)
     V[states], sweeps = iterative_policy_evaluation(P_π, R_π, warm[states], args)
     _, sweeps_from_0 = iterative_policy_evaluation(P_π, R_π, np.zeros(len(states)), args)
     return V, sweeps, sweeps_from_0
@@ -234,7 +235,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
+    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),

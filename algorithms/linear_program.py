@@ -124,7 +124,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # of them; then those go from which every best action may lead out of it.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
+        # (A, S): no chance to come elsewhere. An action that ends has none: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
     # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
@@ -141,8 +141,8 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions without a reward that end, or lead for certain into the largest set
-    of states that the agent need never leave by such actions: to be idle is worth 0."""
+    """(A, S) bool: the actions of expected reward 0 that end, or lead for certain into the largest
+    set of states that the agent need never leave by such actions: to be idle is worth 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
         # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
@@ -208,7 +208,7 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
+    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),

@@ -42,7 +42,8 @@ from tqdm import trange
 
 @dataclass
 class Args:
-    """A sweep is over the states that the policy reaches. V is a sum of rewards, in their unit."""
+    """A sweep is over the states that the policy reaches. V(s) is the expected sum of rewards from
+    state s on, in their unit; π(s) the action in s."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -90,8 +91,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def policy_evaluation(P, R, policy, args: Args) -> tuple[np.ndarray, np.ndarray, int]:
     """V^π (S,) by Algorithm 1, V^π (S,) by the linear system, and the number of sweeps.
 
-    π (S,) int reaches n states; in the others it is -1, and V is NaN. In m of the n states it may
-    still collect something; in the others V is 0.
+    π (S,) int reaches n states; in the others it is -1, and V is NaN. In m of the n states V is
+    worked out; in the others it may collect nothing more, and V is 0.
     """
     states = np.flatnonzero(policy >= 0)  # (n,)
     rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
@@ -235,7 +236,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
+    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -278,7 +279,7 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
 def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) else 1, 0, …
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) or 1, 0, …
     named = args.policy or args.model or args.env_id  # else π1, π2 and π3 of §3.2
     texts = [args.policy] if named else ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]
     for text in texts:

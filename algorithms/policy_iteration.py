@@ -14,7 +14,7 @@ Run it
 
 Measured
     The first command converges to V* = (11, 1, 4) and π* = (a1, a1, a2) with two policies; its
-    tables print the second twice, as the lecture's do.
+    tables print the second twice, as the lecture's do. How V(s) comes about stands in Q(s, π(s)).
 
 Deviations
     An action is changed only for a gain of more than 1e-9 · (1 + |V(s)|): of actions that tie, an
@@ -45,7 +45,8 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """An iteration evaluates and improves a policy. V and Q are sums of rewards, in their unit."""
+    """An iteration evaluates and improves a policy. V(s) is the expected sum of rewards from
+    state s on, in their unit; Q(s, a) the same if the first action is a; π(s) the action in s."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -119,9 +120,6 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
     raise SystemExit(f"error: π has not converged in {max_iterations} iterations")
 
 
-# At discount 1, `proper_policy` and `idle_actions`, below, make the first policy, too.
-
-
 def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     # (I - γ P) V = R
@@ -161,46 +159,36 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     return live
 
 
-def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
-    that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
-    and V is 0).
-
-    Exits if the best actions of a state lead to no end.
-    """
-    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
-    # tie, and an argmax may walk to and fro for ever.
-    V = Q.max(axis=0)  # (S,)
-    tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 that the agent need not leave. At first it has all
-    # of them; then those go from which every best action may lead out of it.
-    rest, before = np.abs(V) <= 1e-9, None  # (S,)
-    while not np.array_equal(rest, before):
-        # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
-        to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
-        rest, before = rest & to_rest.any(axis=0), rest
-    # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
-    # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
-    # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
-    R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it comes to rest
-        Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
-        V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
-    if not V_end.all():
-        raise SystemExit("error: at discount 1 the best actions of a state never come to an end")
-    return Q_end.argmax(axis=0)  # (S,)
-
-
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions without a reward that end, or lead for certain into the largest set
-    of states that the agent need never leave by such actions: to be idle is worth 0."""
+    """(A, S) bool: the actions of expected reward 0 that end, or lead for certain into the largest
+    set of states that the agent need never leave by such actions: to be idle is worth 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
     while not np.array_equal(idle, before):
         # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
         actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
         idle, before = actions.any(axis=0), idle
     return actions
+
+
+def first_policy(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
+    """π (S,) int to begin with. At discount 1 it needs a value: from every state it may come to an
+    end, or to states where it stays idle.
+
+    Exits if no policy does.
+    """
+    if discount < 1:
+        return np.zeros(R.shape[1], int)  # the first action
+    idle = idle_actions(P, R)  # (A, S)
+    policy, done, before = idle.argmax(axis=0), idle.any(axis=0), None  # (S,), (S,)
+    ends = (P.sum(axis=1) < 1 - 1e-9).reshape(R.shape) & np.isfinite(R)  # (A, S)
+    while not np.array_equal(done, before):
+        # From the end backwards: actions that may end, or lead to a state that is done
+        good = ends | ((P @ done).reshape(R.shape) > 0)  # (A, S)
+        policy = np.where(done, policy, good.argmax(axis=0))  # (S,)
+        done, before = done | good.any(axis=0), done  # (S,)
+    if not done.all():
+        raise SystemExit("error: no policy has a value at discount 1: a state comes to no end")
+    return policy
 
 
 # ---- report: reading a model, tables, output -----------------------------------------------------
@@ -281,7 +269,7 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
+    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -306,12 +294,7 @@ def main(args: Args) -> None:
     """Improve the policy that the flags name until it is the best, and report."""
     model, _, P, R = read_model(args)
     text = args.initial_policy or ("" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1")  # π2
-    policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
-    if args.discount == 1 and not text:
-        # Easy to get wrong: at discount 1 the first policy needs a value, so it ends or is idle. It
-        # comes from a made-up Q, of which only the ties count: 0 of idle actions, -1 of all others.
-        tie = np.where(np.isfinite(R), -1, R)  # (A, S), -∞ where there is no action
-        policy = proper_policy(P, R, Q=np.where(idle_actions(P, R), 0, tie))
+    policy = read_policy(text, model) if text else first_policy(P, R, args.discount)  # (S,)
     if policy.min() < 0:
         raise SystemExit("error: --initial-policy needs an action in every state")
     steps = policy_iteration(P, R, policy, args.discount, args.max_iterations)

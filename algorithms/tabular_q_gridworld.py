@@ -24,16 +24,18 @@ Measured, by `python benchmarks/gridworld.py seeds`
     200,000 episodes: Figure 10's policy for 20 of 20 seeds, with max |Q - Q*| from 0.006 to 0.028.
 
 Deviations from the lecture
-    Step reward   -0.025. The lecture's text does not name its rewards. Its Figure 10 is optimal,
-                  undiscounted and with slip 0.2, exactly for step rewards from -0.0274 to -0.0221:
+    Rewards       ±1 in the marked cells, slip 0.2: the lecture's text has no numbers. It pays only
+                  in those cells; here a step costs 0.025, for Figure 10 is optimal, undiscounted,
+                  exactly for step rewards from -0.0274 to -0.0221:
                   `python benchmarks/gridworld.py step-rewards` shows it.
     Convergence   --episodes of them: samples do not tell whether Q has converged.
     α             0.7 · N(s,a)^-0.85, N(s,a) visits: Q settles with a constant α only without slips.
-    ε             falls with each episode, from 1 to 0.7. A greedier robot hardly ever sees (4,1),
-                  and Q-learning learns Q* whatever its robot does (it is off-policy).
+    ε             falls with each episode, from 1 to 0.7. A greedier robot hardly ever sees (4,1);
+                  and Q-learning learns Q* from any behaviour that keeps trying every action in
+                  every state (it is off-policy).
     Discount      --discount, 1 by default as in Equation 34: other environments need one.
     Time limit    1,000 steps, where the environment has none: a policy may never end.
-    Figure 9      "1000 interactions" are 1,000 episodes; 1,000 steps are about 30 episodes.
+    Figure 9      its 1000 interactions are 1,000 episodes; 1,000 steps are about 30 episodes.
 """
 
 import json
@@ -57,7 +59,8 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """Tabular Q-learning (Algorithm 5). A step is an action; an episode runs from reset to end."""
+    """Tabular Q-learning (Algorithm 5). A step is an action; an episode runs from reset to end.
+    Q(s,a) is the expected sum of rewards from state s on, if the first action is a."""
 
     episodes: int = 1000
     """episodes to learn from (Figure 9: 1000)"""
@@ -200,12 +203,14 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
                 a = ties[int(random() * len(ties))]
             s_next, r, terminated, truncated, _ = env.step(a)
 
-            # Q(s,a) = (1 - α) Q(s,a) + α (r + γ max_a' Q(s',a'))             # line 13, Equation 34
-            # Easy to get wrong: r alone where s' is terminal (Equation 36), but not where a time
-            # limit cut the episode short (truncated): there the world would have gone on.
+            # y = r if s' is terminal (Equation 36), else r + γ max_a' Q(s',a')
+            # Easy to get wrong: not r alone where a time limit cut the episode short (truncated):
+            # there the world would have gone on.
             y = r if terminated else r + args.discount * max(Q[s_next])
             N[s][a] += 1
+            # α = learning_rate · N(s,a)^-ω
             alpha = args.learning_rate * N[s][a] ** -args.learning_rate_exponent
+            # Q(s,a) = (1 - α) Q(s,a) + α y                                   # line 13, Equation 34
             Q[s][a] = (1 - alpha) * Q[s][a] + alpha * y
 
             s, done = s_next, terminated or truncated

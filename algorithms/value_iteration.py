@@ -23,8 +23,9 @@ Deviations
     to and fro for ever.
     At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
     only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8, since V_0(s1) = 0. From then
-    on to stay is worth 8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. Then the script exits
-    with an error.
+    on to stay is worth 8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. Or rewards cancel,
+    as -1 from s0 to s1 and 1 back, and V_i swings for ever. Then the script exits with an error;
+    policy_iteration.py solves both.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -47,7 +48,8 @@ from tqdm import tqdm
 
 @dataclass
 class Args:
-    """An iteration is a sweep over all states. V and Q are sums of rewards, in their unit."""
+    """An iteration is a sweep over all states. V(s) is the expected sum of rewards from
+    state s on, in their unit; Q(s, a) the same if the first action is a; π(s) the action in s."""
 
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
@@ -101,9 +103,11 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_000):
     """Algorithm 3: V* (S,), and the largest change of a V(s) in each sweep, relative to |V(s)| if
-    that is above 1.
+    that is above 1. The Bellman Optimality Principle (Equation 27), which V* satisfies, is made an
+    assignment.
 
-    Exits if V has not converged after max_iterations: V* is infinite, or the sweeps are too few.
+    Exits if V has not converged after max_iterations: V* is infinite, the sweeps are too few, or
+    see the deviations.
     """
     V, changes = np.zeros(R.shape[1]), []  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
@@ -130,7 +134,7 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # of them; then those go from which every best action may lead out of it.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): no chance to come elsewhere. So has an action that ends: its row of P is empty.
+        # (A, S): no chance to come elsewhere. An action that ends has none: its row of P is empty.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
     # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
@@ -215,7 +219,7 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead, and for states where π never comes V NaN and π -1. All have a copy of this function."""
+    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -261,7 +265,7 @@ def main(args: Args) -> None:
     model, env, P, R = read_model(args)
     V, changes = value_iteration(P, R, args.discount, args.tolerance, args.max_iterations)
     Q = backup(P, R, V, args.discount)  # (A, S)
-    # π*(s) = argmax_a Q*(s, a)  Equation 31
+    # π*(s) = argmax_a Q*(s, a)  Equations 28 and 31
     policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]

@@ -177,12 +177,14 @@ def value_learning(env: gym.Env, policy: dict, args: Args) -> Iterator[tuple[lis
         while not done:
             s_next, r, terminated, truncated, _ = env.step(policy[s])
 
-            # V(s) = (1 - α) V(s) + α (r + γ V(s'))                      Equation 3, from one sample
-            # Easy to get wrong: r alone where s' is terminal, but not where a time limit cut the
-            # episode short (truncated): there the world would have gone on.
+            # y = r if s' is terminal, else r + γ V(s')                  Equation 3, from one sample
+            # Easy to get wrong: not r alone where a time limit cut the episode short (truncated):
+            # there the world would have gone on.
             y = r if terminated else r + args.discount * V[s_next]
             N[s] += 1
+            # α = learning_rate · N(s)^-ω
             alpha = args.learning_rate * N[s] ** -args.learning_rate_exponent
+            # V(s) = (1 - α) V(s) + α y
             V[s] = (1 - alpha) * V[s] + alpha * y
 
             s, done = s_next, terminated or truncated

@@ -109,9 +109,9 @@ dqn.main(dqn.read_args())
 def test_a_run_leaves_every_file_and_flushes_denormals(tmp_path):
     flags = {"env-id": "ALE/Breakout-v5", "environment-train-frames-max": 700, "threads": 2,
              "agent-replay-buffer-initial": 680, "agent-update-frequency": 4,
-             "environment-evaluation-interval-episodes": 1, "environment-evaluation-episodes": 1,
-             "environment-test-frames": 900, "agent-epsilon-greedy-epsilon-evaluation": 1,
-             "precision": "float32"}
+             "precision": "float32", "environment-evaluation-interval-episodes": 1,
+             "environment-evaluation-episodes": 1, "environment-test-frames": 900,
+             "agent-epsilon-greedy-epsilon-evaluation": 1}
     argv = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
     done = subprocess.run([sys.executable, "-c", DRIVER, *argv], cwd=tmp_path, timeout=120,
                           env=os.environ | {"PYTHONPATH": str(ALGORITHMS)}, capture_output=True)

@@ -39,16 +39,19 @@ class TestPolicies:
             rng = np.random.default_rng(seed)
             model = random_model(rng, proper=discount == 1)
             policy = {s: str(rng.choice(list(model[s]))) for s in model}
-            text = " ".join(f"{s}={a}" for s, a in policy.items())
-            found = run(script, tmp_path, model, discount=discount, policy=text)
-            V = np.array(list(found["values"].values()), float)  # null becomes NaN
+            text = " ".join(map("=".join, policy.items()))
+            values = run(script, tmp_path, model, discount=discount, policy=text)["values"]
+            V, reached = np.array(list(values.values()), float), ["s0"]  # null becomes NaN
+            for s in reached:  # it grows
+                ways = model[s][policy[s]]
+                reached += {n for p, n, _, ends in ways if p and not ends} - {*reached}
+            assert {s for s in values if values[s] is not None} == {*reached}
             np.testing.assert_allclose(V, dense(model, policy, discount) + 0 * V, 1e-8, 1e-6)
 
     def test_that_never_end(self, tmp_path):
-        model = {"s": {"on": [go("t", 4, 0.5), go("goal", 0, 0.5)]},
+        model = {"s": {"on": [go("t", 4, 0.5), go("goal", 0, 0.5)]}, "v": {"gain": [go("v", 3)]},
                  "t": {"on": [go("u")], "out": [go("goal")]},
-                 "u": {"free": [go("t")], "dear": [go("t", -1)]},
-                 "v": {"gain": [go("v", 3)]}}  # fmt: skip
+                 "u": {"free": [go("t")], "dear": [go("t", -1)]}}  # fmt: skip
         free = run(script, tmp_path, model, policy="s=on t=on u=free")  # then for ever for nothing
         assert free["values"] == {"s": 2, "t": 0, "u": 0, "v": None}
         assert run(script, tmp_path, model, policy="s=on t=out v=gain")["values"]["s"] == 2

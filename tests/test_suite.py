@@ -84,7 +84,7 @@ class TestEveryScript:
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 assert ast.get_docstring(node), node.name
         (args,) = [node for node in tree.body if getattr(node, "name", None) == "Args"]
-        for node, after in itertools.pairwise(args.body):
+        for node, after in itertools.pairwise([*args.body, None]):
             if isinstance(node, ast.AnnAssign):
                 assert isinstance(after, ast.Expr), ast.unparse(node)
                 assert isinstance(after.value.value, str), ast.unparse(node)

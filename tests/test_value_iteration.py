@@ -17,10 +17,10 @@ TRAPS = {  # at discount 1: V(s) of the four SOLVERS, N where one refuses
                                    "t": {"on": [go("s", 1, 0.5), go("t", 1, 0.5)]}}),
     "0 of 3": ([N, 0, 0, 0], {"s": {"on": [go("u")], "best": [go("goal")]},
                               "t": {"back": [go("s", 1)]}, "u": {"on": [go("t", -1)]}}),
-    "held up": ([0, N, 0, 0], {"s": {"stay": [go("s", 0, 0.7), go("s", 0, 0.2), go("s", 0, 0.1)],
+    "held up": ([0, N, 0, 0], {"s": {"best": [go("s", 0, 0.7), go("s", 0, 0.2), go("s", 0, 0.1)],
                                      "on": [go("t", 8)]}, "t": {"out": OUT}}),  # .7 + .2 + .1 < 1
-    "to stay is best": ([0, 0, 0, 0], {"s": {"out": OUT, "on": TO_T}, "t": {"back": TO_S}}),
-    "a bet": ([0, 0, 0, 0], {"s": {"out": OUT, "bet": [go("s", 3, 0.4), go("s", -2, 0.6)]}}),
+    "to stay is best": ([0, 0, 0, 0], {"s": {"out": OUT, "best": TO_T}, "t": {"back": TO_S}}),
+    "a bet": ([0, 0, 0, 0], {"s": {"out": OUT, "best": [go("s", 3, 0.4), go("s", -2, 0.6)]}}),
     "rest": ([N, -1, -1, -1], {"s": {"x": [go("s", -1)], "best": [go("t", -1)]}, "t": {"": TO_T}}),
     "a fine": ([1.5, 1.5, 1.5, 1.5], {"s": {"a": [go("goal", 1)], "best": [go("goal", 1.5)],
                                             "c": TO_T}, "t": {"out": [go("goal", -1e9)]}}),
