@@ -500,8 +500,8 @@ def summary(counters, finished: list[tuple[float, int]]) -> dict:
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
-    """write(temporary path), then rename: a crash or a full disk leaves the old file or the new
-    one, never a part. Exits with one line if the disk refuses."""
+    """write(temporary path), then rename: if the program crashes or the disk is full, the old file
+    or the new one is there, never a part. Exits with one line if the disk refuses."""
     temporary = path.absolute().with_name(path.name + ".tmp")  # absolute: pandas expands a ~
     try:
         write(temporary)
@@ -511,19 +511,14 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
         raise SystemExit(f"error: {path} could not be written: {error}") from None
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file."""
-    write_file(path, lambda temporary: temporary.write_text(text))
-
-
 # ---- main ----------------------------------------------------------------------------------------
 
 
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in one of `ranks` processes. Rank 0 evaluates, logs and writes."""
-    # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and with numbers
-    # below 1e-38 (denormal) a CPU is 10 times slower. From here on such numbers count as 0, in
-    # PyTorch's threads, too, which are started later.
+    # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and numbers
+    # below 1e-38 (denormal) make a CPU slow. From here on such numbers count as 0, in PyTorch's
+    # threads, too, which are started later.
     torch.set_flush_denormal(True)
     # For speed alone, on Linux: once a block of 30 MB (at most 32) has been freed, the C library
     # keeps up to 60 MB that are free. Else it gives an update's memory back to the system, and the
@@ -565,8 +560,10 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
         run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
-        write_text(run_dir / "args.json", json.dumps(vars(args) | {"resume": ""}, indent=2))
-        (run_dir / "test.json").unlink(missing_ok=True)  # of the same run before it was lengthened
+        text = json.dumps(vars(args) | {"resume": ""}, indent=2)
+        write_file(run_dir / "args.json", lambda path: path.write_text(text))
+        if counters.frames < args.environment_train_frames_max:
+            (run_dir / "test.json").unlink(missing_ok=True)  # of the run before it was lengthened
         # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
@@ -670,7 +667,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         finished = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
-        write_text(run_dir / "test.json", json.dumps(test, indent=2))
+        write_file(run_dir / "test.json", lambda path: path.write_text(json.dumps(test, indent=2)))
     if ranks > 1:
         # All wait for rank 0: of a stopped run each ends with a code above 0, and with the first
         # torchrun kills the rest.

@@ -220,6 +220,8 @@ class QNetwork(nn.Module):
 
 def find_q_network(args: Args) -> Path:
     """The q_network.pt that the flags name; by default the newest run's, else published Pong's."""
+    if args.run and args.game:
+        raise SystemExit("error: a run or --game, not both")
     if args.run or args.game:
         path = PUBLISHED / args.game if args.game else Path(args.run)
         return path / "q_network.pt" if path.is_dir() else path
@@ -237,7 +239,7 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         trained = types.SimpleNamespace(**content["args"], actions=content["actions"])
         no_ops, repeat = trained.environment_no_op_max, trained.agent_action_repeat
         # A hostile file: Gymnasium would import what stands before a colon, or reset for ever.
-        if ":" in trained.env_id or max(no_ops, repeat) > 10_000:
+        if ":" in trained.env_id or no_ops > 10_000 or repeat > 100:
             raise ValueError("its game has a module's name, or too many no-operations or repeats")
         shape = trained.environment_state_height, trained.environment_state_width
         with torch.device("meta"):  # shapes alone; the file's tensors come if they fit
@@ -306,7 +308,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # with a life less
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # by its action
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")
@@ -390,11 +392,13 @@ def pictures(rows: list, q: np.ndarray, screens: list, trained) -> Iterator[Imag
 def write_video(folder: Path, images: Iterator[Image.Image]) -> None:
     """episode.webm, in VP8, which browsers play; play.gif of its beginning, which starts again for
     ever, in the colours of its first and last image."""
-    stderr = os.dup(2)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # OpenCV has a needless remark on VP8
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)  # OpenCV has a needless remark on VP8
     codec = cv2.VideoWriter_fourcc(*"VP80")
     video = cv2.VideoWriter(str(folder / "episode.webm"), codec, FRAMES_PER_SECOND, VIDEO_SIZE)
     os.dup2(stderr, 2)
+    os.close(stderr)
+    os.close(nowhere)
     if not video.isOpened():
         raise OSError("OpenCV does not open episode.webm")
     beginning = []

@@ -96,8 +96,6 @@ class Args:
                 raise SystemExit(f"error: {name} must be in [0, 1]")
         if self.episodes < 1 or self.seed < 0 or not np.isfinite(self.step_reward):
             raise SystemExit("error: needs episodes >= 1, seed >= 0 and a finite step_reward")
-        if self.runs_dir.is_file():
-            raise SystemExit(f"error: {self.runs_dir} is not a folder")
 
 
 # ---- problem: GridWorld --------------------------------------------------------------------------
@@ -310,7 +308,10 @@ def main() -> None:
         Q_star = optimal_action_values(model, args.discount)  # (S, A)
     name = f"{args.env_id.replace('/', '-')}__tabular_q_gridworld__{args.seed}"
     run_dir = args.runs_dir / f"{name}__{time.strftime('%Y%m%d-%H%M%S')}"
-    run_dir.mkdir(parents=True)
+    try:
+        run_dir.mkdir(parents=True)
+    except OSError as error:  # a file in the way, or another run of this second
+        raise SystemExit(f"error: {error}") from None
     (run_dir / "args.json").write_text(json.dumps(vars(args), default=str), encoding="utf-8")
 
     returns, curve = [], []

@@ -87,8 +87,6 @@ class Args:
                 raise SystemExit(f"error: {name} must be in [0, 1]")
         if self.episodes < 1 or self.seed < 0 or not np.isfinite(self.step_reward):
             raise SystemExit("error: needs episodes >= 1, seed >= 0 and a finite step_reward")
-        if self.runs_dir.is_file():
-            raise SystemExit(f"error: {self.runs_dir} is not a folder")
 
 
 # ---- problem: GridWorld and a policy -------------------------------------------------------------
@@ -242,7 +240,6 @@ def draw_values(axes: Axes, world: GridWorld, V: np.ndarray, policy: dict, title
         axes.bar(x, 1, 1, y - 0.5, color=colour, edgecolor="0.5", linewidth=0.6)  # a square
         axes.text(x, y, text, fontsize=24, weight="bold", ha="center", va="center")
     axes.set(xticks=[1, 2, 3, 4], yticks=[1, 2, 3], aspect="equal", facecolor="0.8", title=title)
-    axes.set(xlim=(0.3, 4.7), ylim=(0.3, 3.7))
 
 
 # ---- main ----------------------------------------------------------------------------------------
@@ -256,7 +253,10 @@ def main() -> None:
     V_pi = exact_values(world, policy, args.discount)  # (S,)
     name = f"GridWorld__value_learning_gridworld__{args.seed}"
     run_dir = args.runs_dir / f"{name}__{time.strftime('%Y%m%d-%H%M%S')}"
-    run_dir.mkdir(parents=True)
+    try:
+        run_dir.mkdir(parents=True)
+    except OSError as error:  # a file in the way, or another run of this second
+        raise SystemExit(f"error: {error}") from None
     (run_dir / "args.json").write_text(json.dumps(vars(args), default=str), encoding="utf-8")
 
     curve = []

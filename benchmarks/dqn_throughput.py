@@ -222,11 +222,11 @@ def parts(args: Args) -> dict[str, float]:
     def update(precision: str) -> None:
         dqn.update(q_network, target_network, optimizer, minibatch, 0.99, precision)
 
-    def grow_old() -> None:
-        for θ in (q_network.layers[7].weight, q_network.head.weight):
-            θ.grad[..., ::2] = 0
-            optimizer.state[θ]["exp_avg"][..., ::2] = 1e-40
-            optimizer.state[θ]["exp_avg_sq"][..., ::2] = 1e-40
+    def grow_old() -> None:  # half of the units of the linear layer are dead
+        θ = q_network.layers[7].weight  # (512, 3136): a unit is a row
+        θ.grad[::2] = 0
+        optimizer.state[θ]["exp_avg"][::2] = 1e-40
+        optimizer.state[θ]["exp_avg_sq"][::2] = 1e-40
 
     frame = milliseconds(step, FILLED)
     emulator = milliseconds(emulate, 2_000)
@@ -253,9 +253,9 @@ def old_without_flushing() -> float:
     adam.step()
 
     def grow_old() -> None:
-        θ.grad[:, ::2] = 0
-        adam.state[θ]["exp_avg"][:, ::2] = 1e-40
-        adam.state[θ]["exp_avg_sq"][:, ::2] = 1e-40
+        θ.grad[::2] = 0
+        adam.state[θ]["exp_avg"][::2] = 1e-40
+        adam.state[θ]["exp_avg_sq"][::2] = 1e-40
 
     return milliseconds(adam.step, 100, grow_old)
 
@@ -316,12 +316,13 @@ def compare_simulators(args: Args, times: dict[str, float]) -> None:
     print(f"\n{'frames a second, ' + precision:<38}{title:>28}")
     for name in contenders:
         print(f"{name:<38}{found[name]:>19.1f} ({found[name] / found['dqn_atari.py']:.2f})")
-    parts = {"emulation": sum(list(times.values())[:2]), "acting": times["act"],
-             "learning": (times["sample"] + times[f"update, {precision}"]) / 4}
-    shares = [f"{name} {ms / sum(parts.values()):.0%}" for name, ms in parts.items()]
+    emulation = times["emulate (the bare emulator)"] + times["preprocess, compress, store"]
+    learning = (times["sample"] + times[f"update, {precision}"]) / 4
+    frame = {"emulation": emulation, "acting": times["act"], "learning": learning}
+    shares = [f"{name} {ms / sum(frame.values()):.0%}" for name, ms in frame.items()]
     print(f"of a frame of dqn_atari.py: {', '.join(shares)}")
     print(f"extrapolated: with cores enough for the simulators and acting, learning alone is left: "
-          f"{1000 / parts['learning']:.0f} frames a second")
+          f"{1000 / learning:.0f} frames a second")
 
 
 def main(args: Args) -> None:
@@ -330,11 +331,11 @@ def main(args: Args) -> None:
 
     args.frames = max(1, args.frames // TURN) * TURN
     print(f"{args.env_id}; {cpu_name()}, {os.cpu_count()} cores; PyTorch {torch.__version__}\n")
-    print(f"{'milliseconds':<38}")
+    print("milliseconds")
     times = in_a_process(flushed_parts, args)
     for name, value in times.items():
         print(f"{name:<38}{value:>10.2f}", flush=True)
-    print(f"{'  the same, denormals not flushed':<38}{in_a_process(old_without_flushing):>10.2f}")
+    print(f"{'  the layer, denormals not flushed':<38}{in_a_process(old_without_flushing):>10.2f}")
     if args.parallel:
         compare_simulators(args, times)
     else:

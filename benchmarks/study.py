@@ -8,9 +8,9 @@
 
 All other flags go to algorithms/dqn_atari_ablation.py, for example --environment-train-frames-max
 500000. Seeds count from --seed up. Given again, a command skips the runs that have finished and
-resumes those that were cut off. Each arm has a folder of its own in --runs-dir. The arm that the
-three studies share, Table 3 on Breakout, runs once if they are run one after another. Each run
-chooses its precision; --precision float32 makes it the same for all.
+resumes those that were cut off. In --runs-dir each initialization and switch has a folder. The arm
+that the three studies share, Table 3 on Breakout, runs once if they are run one after another. Each
+run chooses its precision, and keeps it; --precision float32 makes it the same for all new ones.
 
 On a cluster the runs go side by side. --list prints one command a run, safe to give again when the
 runs have ended:
@@ -82,9 +82,9 @@ TABLES = {  # which part of an arm its rows vary; the rest is the standard arm's
 STANDARD = Arm("Breakout")  # a row of all three
 FIGURES = ["score_mean", "score_variance", "length_mean", "length_variance"]
 NAMES = {
-    **{True: "Yes", False: "No", "Riverraid": "River Raid", "SpaceInvaders": "Space Invaders"},
-    **{"default": "PyTorch Default", "he": "He", "orthogonal": "Orthogonal"},
-}
+    True: "Yes", False: "No", "Riverraid": "River Raid", "SpaceInvaders": "Space Invaders",
+    "default": "PyTorch Default", "he": "He", "orthogonal": "Orthogonal",
+}  # fmt: skip
 # scores of random play and of a person (DQN Zoo)
 RANDOM_AND_HUMAN = {
     "Breakout": (1.7, 30.5),
@@ -106,9 +106,9 @@ STUDIES = {  # each arm's flags
 TABLE_3 = "Table 3's hyperparameters"
 # flags that tell arms and seeds apart, or say only how a run is carried out
 NOT_COMPARED = {
-    *("env_id", "initialization", "target_network", "replay_buffer", "seed"),
-    *("device", "precision", "threads", "runs_dir", "resume", "checkpoint_interval_minutes"),
-}
+    "env_id", "initialization", "target_network", "replay_buffer", "seed", "device", "precision",
+    "threads", "runs_dir", "resume", "checkpoint_interval_minutes",
+}  # fmt: skip
 
 
 # ---- run directories ---------------------------------------------------------------------------

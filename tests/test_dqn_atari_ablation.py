@@ -1,13 +1,14 @@
 """dqn_atari_ablation.py: without its switches it is dqn_atari.py, each switch does one thing."""
 
-import csv
-import math
+import difflib
+import itertools
 from pathlib import Path
 
 import dqn_atari
 import dqn_atari_ablation as ablation
 import dqn_atari_parallel as parallel
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from test_dqn_atari import weights
@@ -42,26 +43,23 @@ def run(tmp_path, monkeypatch):
     return call
 
 
-def rows(run_dir: Path) -> list[dict]:
-    with open(run_dir / "evaluations.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_without_switches_it_is_dqn_atari(run):
-    one, _ = run(dqn_atari)
-    other, _ = run(ablation)
+    one, other = run(dqn_atari)[0], run(ablation)[0]
     assert all(torch.equal(θ, weights(other)[name]) for name, θ in weights(one).items())
-    untimed = [{k: v for k, v in row.items() if k != "seconds"} for row in rows(one)]
-    for row, more in zip(untimed, rows(other), strict=True):
-        assert row.items() <= more.items()
-        assert set(more) - set(row) == {"seconds", "held_out_max_q_mean"}
-        assert math.isfinite(float(more["held_out_max_q_mean"]))
+    tables = [pd.read_csv(x / "evaluations.csv", index_col="frames") for x in (one, other)]
+    few, more = (table.drop(columns="seconds") for table in tables)
+    assert few.equals(more[[*few]]) and {*more} - {*few} == {"held_out_max_q_mean"}
+    assert len(more) and np.isfinite(more["held_out_max_q_mean"]).all()
 
 
 def test_diff_shows_the_switches_and_nothing_else():
-    one, other = (set(definitions(ALGORITHMS / f"dqn_atari{end}.py")) for end in ("", "_ablation"))
-    assert one - other == {"initialize_orthogonal"}
-    assert other - one == {"initialize", "held_out_states", "max_q_mean"}
+    one, other = (definitions(ALGORITHMS / f"dqn_atari{end}.py") for end in ("", "_ablation"))
+    assert one.keys() - other == {"initialize_orthogonal"}
+    assert other.keys() - one == {"initialize", "held_out_states", "max_q_mean"}
+    lines = (difflib.ndiff(one[x].splitlines(), other[x].splitlines()) for x in ("Args", "main"))
+    assert [line[2:].strip() for line in itertools.chain(*lines) if line.startswith("- ")] == [
+        'env_id: str = "PongNoFrameskip-v4"', "initialize_orthogonal(q_network)",
+        "counters.evaluations.append(summary(counters, finished))"]
     for Args in (ablation.Args, parallel.Args):  # first stand Table 3's
         assert list(vars(Args()).items())[:23] == list(vars(dqn_atari.Args()).items())[:23]
 

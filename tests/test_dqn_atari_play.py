@@ -33,7 +33,7 @@ def episode(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(play, "play", lambda *a: returned.append(whole(*a)) or returned[-1])
         play.main(play.Args(str(path.parent), epsilon=EPSILON, seed=SEED, video_seconds=13.0))
-    folder, screens = path.parent / f"play-seed{SEED}", returned[0][2]
+    folder, (rows, _, screens) = path.parent / f"play-seed{SEED}", returned[0]
     trace = np.genfromtxt(folder / "trace.csv", None, delimiter=",", names=True, encoding="utf-8")
     ale = ale_py.ALEInterface()
     ale.setFloat("repeat_action_probability", 0.0)
@@ -49,7 +49,7 @@ def episode(tmp_path_factory):
         lives.append(ale.lives())
     assert ale.game_over() and max(rewards) > 1
     return SimpleNamespace(path=path, folder=folder, trace=trace, screens=screens, seen=seen[:-1],
-                           rewards=rewards, lives=lives, weights=saved["q_network"])
+                           rewards=rewards, lives=lives, weights=saved["q_network"], rows=rows)
 
 
 def test_trace_is_the_game(episode):
@@ -79,6 +79,20 @@ def test_files_are_whole_and_the_video_is_the_game(episode):
     errors = [np.abs(np.array(images[1:]) - episode.seen[d : d + 194]).mean() for d in range(3)]
     assert errors[1] == min(errors) < 4  # of 255, beside those of the frames before and after
     assert not video.read()[0] and video.get(cv2.CAP_PROP_FPS) == 15
+
+
+def test_figures_show_the_game(episode):
+    rows, value = episode.rows, episode.trace["value"]
+    q = np.stack([episode.trace[f"q_{name}"] for name in ACTIONS], axis=1)
+    top = play.draw_curves(rows, q, [9], play.load(episode.path)[1]).axes[0]
+    rewarded, lost, _ = top.collections
+    assert np.array_equal(top.lines[0].get_ydata(), value)
+    assert np.array_equal(rewarded.get_offsets()[:, 0], np.flatnonzero(episode.rewards))
+    ends = [path.vertices[0, 0] for path in lost.get_paths()]
+    assert ends == [t for t in range(1, len(rows)) if episode.lives[t] < episode.lives[t - 1]]
+    for t, axes in zip((8, 9, 10), play.draw_moments(rows, episode.screens, [9]).axes, strict=True):
+        assert np.array_equal(axes.images[0].get_array(), episode.seen[t])
+        assert axes.get_title().startswith(f"frame {t}\nvalue {value[t]:.3f}\n")
 
 
 def test_panel_marks_the_best_and_the_taken_action(episode):

@@ -111,13 +111,12 @@ def test_tables_hold_means_over_seeds_and_the_iqm_and_mix_nothing_unlike(study, 
     runs = [(500.0, {"seed": 1})]  # older than the other run of this seed: does not count
     runs += [(score, {"seed": seed, "threads": seed}) for seed, score in enumerate(scores, 1)]
     runs += [(3.5, {"replay_buffer": False}), (7.0, {"environment_train_frames_max": 9})]
-    names = ("score_mean", "score_variance", "length_mean", "length_variance")
+    names = [*enumerate(("score_mean", "score_variance", "length_mean", "length_variance"))]
     for number, (score, args) in enumerate(runs):  # dqn_atari.py writes no fields of an arm
         run_dir = tmp_path / "runs" / (f"run__{number}" if number else "published")
         run_dir.mkdir(parents=True)
         (run_dir / "args.json").write_text(json.dumps(args))
-        test = json.dumps({name: score * 10**i for i, name in enumerate(names)})
-        (run_dir / "test.json").write_text(test)
+        (run_dir / "test.json").write_text(json.dumps({n: score * 10**i for i, n in names}))
         (run_dir / "evaluations.csv").write_text(f"frames,score_mean\n5,{score}\n")
     code, text, _ = study("tables", "--markdown", "--figure", "curves.png")
     assert code == 0 and (tmp_path / "curves.png").exists()
