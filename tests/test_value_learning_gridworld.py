@@ -69,8 +69,7 @@ class TestCommandLine:
             assert cell["action"] == FIGURE_10[s]
             assert cell["V^π"] == pytest.approx(values(FIGURE_10)[s])
             assert f"{cell['V']:.3f}" in done.stdout and f"{cell['V^π']:.3f}" in done.stdout
-        assert (run / "figure.png").read_bytes().startswith(b"\x89PNG")
-        assert list(run.glob("events*"))
+        assert [*run.glob("events*")] and (run / "figure.png").read_bytes().startswith(b"\x89PNG")
 
     def test_a_policy_of_ones_own_and_a_cell_never_visited(self, tmp_path, monkeypatch):
         policy = Args().policy.replace("3,2=left", "3,2=up")
