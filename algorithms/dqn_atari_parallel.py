@@ -135,7 +135,7 @@ class Args:
 
     # This script's own
     env_id: str = "PongNoFrameskip-v4"
-    """game, by any of its Gymnasium names; PongNoFrameskip-v4 and ALE/Pong-v5 mean the same here"""
+    """game; ALE/Pong-v5 means the same as PongNoFrameskip-v4"""
     seed: int = 1
     """of the weights, exploration, minibatches, no-operations and evaluations"""
     environment_test_frames: int = 135_000
@@ -149,7 +149,7 @@ class Args:
     checkpoint_interval_minutes: float = 10.0
     """minutes between two savings, at most"""
     resume: str = ""
-    """run directory to go on with; only --environment-train-frames-max may be raised"""
+    """run to go on with; only --environment-train-frames-max may be raised"""
     runs_dir: str = "runs"
     """folder for the run directory"""
 
