@@ -646,7 +646,7 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 def main(args: Args) -> None:
     """Algorithm 6 (its line numbers head the comments), and what it needs and leaves behind."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and numbers
-    # below 1e-38 (denormal) make a CPU slow. From here on such numbers count as 0, in PyTorch's
+    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0, in PyTorch's
     # threads, too, which are started later.
     torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())

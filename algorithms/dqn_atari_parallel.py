@@ -517,7 +517,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in one of `ranks` processes. Rank 0 evaluates, logs and writes."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and numbers
-    # below 1e-38 (denormal) make a CPU slow. From here on such numbers count as 0, in PyTorch's
+    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0, in PyTorch's
     # threads, too, which are started later.
     torch.set_flush_denormal(True)
     # For speed alone, on Linux: once a block of 30 MB (at most 32) has been freed, the C library

@@ -222,12 +222,6 @@ def parts(args: Args) -> dict[str, float]:
     def update(precision: str) -> None:
         dqn.update(q_network, target_network, optimizer, minibatch, 0.99, precision)
 
-    def grow_old() -> None:  # half of the units of the linear layer are dead
-        θ = q_network.layers[7].weight  # (512, 3136): a unit is a row
-        θ.grad[::2] = 0
-        optimizer.state[θ]["exp_avg"][::2] = 1e-40
-        optimizer.state[θ]["exp_avg_sq"][::2] = 1e-40
-
     frame = milliseconds(step, FILLED)
     emulator = milliseconds(emulate, 2_000)
     minibatch = replay.gather(rng.integers(len(replay), size=32))
@@ -239,25 +233,29 @@ def parts(args: Args) -> dict[str, float]:
         "update, float32": milliseconds(lambda: update("float32")),
         "update, bfloat16": milliseconds(lambda: update("bfloat16")),
         "of it Adam's step": milliseconds(optimizer.step),
-        "Adam's step when old": milliseconds(optimizer.step, 100, grow_old),
     }
     return times
 
 
-def old_without_flushing() -> float:
-    """Milliseconds of an old Adam's step where denormal numbers are not flushed."""
-    torch.set_flush_denormal(False)
-    θ = torch.zeros(512, 3136, requires_grad=True)
-    θ.grad = torch.ones_like(θ)
-    adam = torch.optim.Adam([θ], lr=1e-4, fused=True)
-    adam.step()
+def old_adam_step(flush: bool) -> float:
+    """Milliseconds of Adam's step where half of the linear layer's units are dead, and their
+    moments denormal numbers; `flush`: whether these count as 0."""
+    import dqn_atari as dqn
+
+    torch.set_flush_denormal(flush)
+    q_network = dqn.QNetwork(4, 84, 84, num_actions=6)
+    optimizer = dqn.make_optimizer(dqn.Args(), q_network)
+    for θ in q_network.parameters():
+        θ.grad = torch.ones_like(θ)
+    optimizer.step()
+    θ = q_network.layers[7].weight  # (512, 3136): a unit is a row
 
     def grow_old() -> None:
         θ.grad[::2] = 0
-        adam.state[θ]["exp_avg"][::2] = 1e-40
-        adam.state[θ]["exp_avg_sq"][::2] = 1e-40
+        optimizer.state[θ]["exp_avg"][::2] = 1e-40
+        optimizer.state[θ]["exp_avg_sq"][::2] = 1e-40
 
-    return milliseconds(adam.step, 100, grow_old)
+    return milliseconds(optimizer.step, 100, grow_old)
 
 
 def in_a_process(call, *args):
@@ -335,7 +333,8 @@ def main(args: Args) -> None:
     times = in_a_process(flushed_parts, args)
     for name, value in times.items():
         print(f"{name:<38}{value:>10.2f}", flush=True)
-    print(f"{'  the layer, denormals not flushed':<38}{in_a_process(old_without_flushing):>10.2f}")
+    for name, flush in (("Adam's step when old", True), ("  denormal numbers not flushed", False)):
+        print(f"{name:<38}{in_a_process(old_adam_step, flush):>10.2f}", flush=True)
     if args.parallel:
         compare_simulators(args, times)
     else:
