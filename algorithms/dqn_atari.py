@@ -40,7 +40,7 @@ Deviations
     [8]'s code: an episode's first        copies of its first frame           an empty frame is
     states have empty frames                                                  no screen of the game
     [8]'s code: screens averaged by area  bilinear, without antialiasing      §7.2.1 says bilinear
-    [8]'s code: no-operations after each  none; the agent goes on             no action of its own
+    [8]'s code: no-operations after each  none; the agent goes on             nothing was reset
     lost life, too
     [8]'s code: θ⁻ every 10,000 frames    40,000 in the command above         Figure 18: updates
     raw frames, shared by reference       LZ4 frames, shared by reference     0.4 to 1.4 GB, not 11
@@ -397,6 +397,7 @@ class QNetwork(nn.Module):
         self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
+        # float() makes a new array of the uint8, which is divided in place: no third one.
         x = self.layers(states.float().div_(255))  # (B, 512)
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):

@@ -386,6 +386,7 @@ class QNetwork(nn.Module):
         self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
+        # float() makes a new array of the uint8, which is divided in place: no third one.
         x = self.layers(states.float().div_(255))  # (B, 512)
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):

@@ -14,8 +14,8 @@ with: until a run has freed a large block of memory, the C library of Linux give
 back to the system after each, and page faults are timed that a run of hours hardly has.
 
 A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
-when it is old: moments of half of its units denormal, with and without the flag that flushes
-them. Runs keep the frames per second of their first and last tenth in test.json.
+when it is old: moments of half of the linear layer's units denormal, with and without the flag that
+flushes them. Runs keep the frames per second of their first and last tenth in test.json.
 """
 
 import contextlib
@@ -225,7 +225,7 @@ def parts(args: Args) -> dict[str, float]:
     frame = milliseconds(step, FILLED)
     emulator = milliseconds(emulate, 2_000)
     minibatch = replay.gather(rng.integers(len(replay), size=32))
-    times = {
+    return {
         "emulate (the bare emulator)": emulator,
         "preprocess, compress, store": frame - emulator,
         "act": milliseconds(lambda: dqn.epsilon_greedy(q_network, replay.decode([s]), 0.0, rng)),
@@ -234,7 +234,6 @@ def parts(args: Args) -> dict[str, float]:
         "update, bfloat16": milliseconds(lambda: update("bfloat16")),
         "of it Adam's step": milliseconds(optimizer.step),
     }
-    return times
 
 
 def old_adam_step(flush: bool) -> float:

@@ -279,9 +279,8 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     frames, updates = saved["counters"]["frames"], saved["counters"]["updates"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", output.splitlines()[-1].split()[4:])
-    flags = vars(parallel.read_args()) | {
-        "environment_train_frames_max": frames + 140, "seed": 2}  # another θ₀
-    first = Run(run_dir.parent, **flags).updates[0]
+    flags = vars(parallel.read_args()) | {"environment_train_frames_max": frames + 140, "seed": 2}
+    first = Run(run_dir.parent, **flags).updates[0]  # seed 2: another θ₀
     assert first["frames"] >= 100 and first["adam"] == updates + 1
     for seen, name in (("before", "q_network"), ("target", "target_network")):
         assert torch.equal(first[seen], saved[name]["head.weight"])

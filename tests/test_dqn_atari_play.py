@@ -149,9 +149,9 @@ def test_the_newest_run_is_found_else_the_published_one(tmp_path, monkeypatch):
     {"file": lambda raw, s: s | {"frames": Path("its unpickling could run code")}},
     {"file": lambda raw, s: (s["q_network"]["head.bias"].fill_(torch.nan), s)[1]},
     {"env_id": "this:Pong-v5"}, {"env_id": "CartPole-v1"}, {"environment_state_height": 10**7},
-    {"environment_no_op_max": 10**12}, {"agent_action_repeat": 10**9}, {"agent_action_repeat": 0},
+    {"environment_no_op_max": 10**12}, {"agent_action_repeat": 101}, {"agent_action_repeat": 0},
     {"epsilon": 1.5}, {"epsilon": float("nan")}, {"games": 0}, {"seed": -1},
-    {"video_seconds": 0.0}, {"run": "nowhere"}, {"output": "q_network.pt"}])
+    {"video_seconds": 0.0}, {"game": "pong"}, {"run": "nowhere"}, {"output": "q_network.pt"}])
 def test_bad_input_is_one_line_and_nothing_is_written(bad, episode, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     change = bad.get("file", lambda raw, s: s | {"args": s["args"] | bad})

@@ -152,7 +152,7 @@ def test_killed_and_resumed_is_never_stopped(straight, tmp_path):
     assert everything(only(tmp_path)) == straight[1]
 
 
-def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path):
+def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path, monkeypatch):
     assert run(runs_dir=tmp_path, environment_train_frames_max=250) == 0
     early = (only(tmp_path) / "checkpoint.pt").read_bytes()
     flags = "--resume", only(tmp_path), "--environment-train-frames-max", FRAMES
@@ -163,6 +163,10 @@ def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path):
     assert everything(only(tmp_path)) == straight[1]
     curve = EventAccumulator(str(only(tmp_path))).Reload().Scalars("charts/SPS")
     assert [point.step for point in curve] == list(range(50, FRAMES, 50))  # each once
+    monkeypatch.setattr(dqn, "evaluate", lambda *_, number: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):  # its test, repeated, is cut off
+        run("--resume", only(tmp_path))
+    assert (only(tmp_path) / "test.json").exists()
 
 
 def test_the_precision_and_the_threads_of_a_run_are_kept(tmp_path, monkeypatch):
