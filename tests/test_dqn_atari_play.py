@@ -119,7 +119,7 @@ def test_largest_jumps_against_every_choice(seed):
 
 
 @pytest.mark.parametrize("game, modest", [("pong", 5), ("breakout", 10), ("space_invaders", 150),
-                                          ("enduro", 99), ("riverraid", 1400)])
+                                          ("enduro", 99), ("riverraid", 1800)])
 def test_published_agents_play_and_games_have_mean_and_variance(game, modest, capsys, monkeypatch):
     folder = PONG.parent / game
     played, whole, before = [], play.play, sorted(folder.rglob("*"))
