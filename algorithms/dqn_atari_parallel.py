@@ -616,8 +616,8 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         x, r, terminated, truncated, info = envs.step_wait()  # (N, 84, 84) uint8, (N,) each
         ended = terminated | truncated
         for i in range(args.num_simulators):
-            # After an end x[i] is the next episode's first frame (AutoresetMode.SAME_STEP, in main),
-            # and the last frame of s' is in info.
+            # After an end x[i] is the next episode's first frame (AutoresetMode.SAME_STEP, in
+            # main), and the last frame of s' is in info.
             frame = info["final_obs"][i] if ended[i] else x[i]
             s_next = (*s[i][1:], lz4.block.compress(frame))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
