@@ -156,7 +156,7 @@ def read_args() -> Args:
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
-    # ε and γ are in [0, 1], three more may be 0, all others are above 0; NaN is refused, too.
+    # ε and γ are in [0, 1], those named may be 0, all others are above 0; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9

@@ -27,7 +27,7 @@ Run it
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
 Measured, on two cores of an AMD EPYC, bfloat16, one update in four
-    202 frames a second with 8 simulators, where dqn_atari.py makes 177: 81 % of a frame is
+    202 frames a second with 8 simulators, where dqn_atari.py makes 177: 81 % of its frame is
     learning, which both cores are busy with
 
 Deviations, beside those of dqn_atari.py
@@ -43,7 +43,8 @@ Deviations, beside those of dqn_atari.py
 
 A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
 acts until that holds the initial number (these frames count), then learns on; its random numbers
-start anew. All machines must see runs/RUN. 30 s after Ctrl-C torchrun kills what still runs.
+start anew. All machines must see runs/RUN. 30 s after Ctrl-C torchrun kills what still
+runs: if that is an evaluation, its last checkpoint is from before.
 """
 
 import contextlib
@@ -169,7 +170,7 @@ def read_args() -> Args:
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
-    # ε and γ are in [0, 1], three more may be 0, all others are above 0; NaN is refused, too.
+    # ε and γ are in [0, 1], those named may be 0, all others are above 0; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
         low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
@@ -565,15 +566,16 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         write_file(run_dir / "args.json", lambda path: path.write_text(text))
         if counters.frames < args.environment_train_frames_max:
             (run_dir / "test.json").unlink(missing_ok=True)  # of the run before it was lengthened
-        # Purged: TensorBoard's points after the checkpoint, whose frames are played once more.
+        # Purged: TensorBoard's points after the checkpoint, whose numbers come once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     loss = torch.zeros(())  # until the first update
 
     def save() -> None:
         """Of rank 0: q_network.pt, what it takes to play, and checkpoint.pt, to learn on."""
-        if not loss.isfinite():  # a NaN never leaves the weights again
-            raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
+        # A NaN, of another rank's gradient, too, reaches the head and never leaves it again.
+        if not (loss + q_network.head.bias.sum()).isfinite():
+            raise SystemExit("error: a weight or the loss is NaN; lower --optimizer-learning-rate")
         writer.flush()
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
                    "q_network": q_network.state_dict()}
@@ -714,5 +716,6 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    except (OSError, KeyboardInterrupt) as error:  # a full disk; Ctrl-C before or after the loop
-        raise SystemExit(f"error: {str(error) or 'interrupted'}") from None
+    # A full disk; a simulator that dies as it starts; Ctrl-C before or after the loop.
+    except (OSError, EOFError, KeyboardInterrupt) as error:
+        raise SystemExit(f"error: {str(error) or 'interrupted, or a simulator has died'}") from None

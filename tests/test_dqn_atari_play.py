@@ -129,7 +129,7 @@ def test_published_agents_play_and_games_have_mean_and_variance(game, modest, ca
     assert min(scores) >= modest and sorted(folder.rglob("*")) == before
     out = capsys.readouterr().out
     for a, b in (scores, [len(rows) for rows, _, _ in played]):
-        assert f"{(a + b) / 2:.5g}" in out and f"{(a - b) ** 2 / 2:.5g}" in out
+        assert f"mean {(a + b) / 2:.5g}, variance {(a - b) ** 2 / 2:.5g}\n" in out
 
 
 def test_the_newest_run_is_found_else_the_published_one(tmp_path, monkeypatch):
