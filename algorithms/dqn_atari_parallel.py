@@ -44,7 +44,7 @@ Deviations, beside those of dqn_atari.py
 A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
 acts until that holds the initial number (these frames count), then learns on; its random numbers
 start anew. All machines must see runs/RUN. 30 s after Ctrl-C torchrun kills what still
-runs: if that is an evaluation, its last checkpoint is from before.
+runs: an evaluation that takes longer ends without a new checkpoint.
 """
 
 import contextlib
