@@ -167,14 +167,18 @@ def read_args() -> Args:
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
-    # ε and γ are in [0, 1], those named may be 0, all others are above 0; NaN is refused, too.
+    # ε and γ are in [0, 1], a screen has at least the 36 lines and columns that Table 2's filters
+    # need, those named may be 0, all others are above 0; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
-        low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
+        zero = share or name in ("seed", "threads", "environment_no_op_max")
+        low = 0 if zero else 36 if "_state_" in name else 1e-9
         if type(value) in (int, float) and not low <= value <= (1 if share else 2**31):
             raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
     if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
         raise SystemExit("error: --agent-replay-buffer-initial is above the maximum length")
+    if args.device in ("cuda", "mps") and not torch.get_device_module(args.device).is_available():
+        raise SystemExit(f"error: PyTorch finds no device for --device {args.device}")
     return args
 
 
@@ -194,8 +198,7 @@ class JoystickActions(gym.ActionWrapper):
     def __init__(self, env: gym.Env):
         super().__init__(env)
         minimal = env.unwrapped.get_action_meanings()
-        joystick = ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")
-        self.meanings = [name for name in minimal if name in joystick]
+        self.meanings = [x for x in minimal if x in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
         self.indices = [minimal.index(name) for name in self.meanings]
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
@@ -485,10 +488,9 @@ def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
     return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
 
 
-def choose_precision(args: Args) -> str:
-    """Time 30 updates of zeros in float32 and bfloat16: bfloat16 if it saves a tenth."""
-    shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
-    q_network = QNetwork(*shape, num_actions=6).to(args.device, memory_format=torch.channels_last)
+def choose_precision(args: Args, q_network: QNetwork, shape: tuple[int, int, int]) -> str:
+    """Time 30 updates of zeros in float32 and bfloat16: bfloat16 if it saves a tenth. They change
+    `q_network`, a copy; `shape` is that of a state."""
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     s = s.to(memory_format=torch.channels_last)  # as gather gives it
@@ -660,8 +662,6 @@ def main(args: Args) -> None:
     # 1  Initialize the Atari 2600 simulator.
     env = FrameHistory(make_env(args, no_op_rng, training=True), args.agent_history_length)
     actions = env.get_wrapper_attr("meanings")
-    if args.precision == "auto":
-        args.precision = choose_precision(args)
     # 2  Initialize 𝒟.
     shape = (args.agent_history_length, args.environment_state_height, args.environment_state_width)
     replay = ReplayMemory(args.agent_replay_buffer_maximum_length, shape, args.device)
@@ -670,6 +670,8 @@ def main(args: Args) -> None:
     q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)  # quicker convolutions
+    if args.precision == "auto":
+        args.precision = choose_precision(args, copy.deepcopy(q_network), shape)
     optimizer = make_optimizer(args, q_network)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)

@@ -35,6 +35,7 @@ Deviations
 import dataclasses
 import itertools
 import os
+import signal
 import sys
 import types
 import zipfile
@@ -101,8 +102,7 @@ class JoystickActions(gym.ActionWrapper):
     def __init__(self, env: gym.Env):
         super().__init__(env)
         minimal = env.unwrapped.get_action_meanings()
-        joystick = ("NOOP", "FIRE", "UP", "RIGHT", "LEFT", "DOWN")
-        self.meanings = [name for name in minimal if name in joystick]
+        self.meanings = [x for x in minimal if x in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
         self.indices = [minimal.index(name) for name in self.meanings]
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
@@ -457,4 +457,5 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
+    signal.signal(signal.SIGINT, lambda *_: sys.exit("error: interrupted"))  # Ctrl-C
     main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))

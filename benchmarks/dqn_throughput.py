@@ -2,14 +2,14 @@
 
     pip install -r requirements.txt -r benchmarks/requirements.txt
     python benchmarks/dqn_throughput.py                 # dqn_atari.py, at both replay ratios
-    python benchmarks/dqn_throughput.py --parallel      # dqn_atari_parallel.py, 1 to 8 simulators
+    python benchmarks/dqn_throughput.py --parallel      # dqn_atari_parallel.py, 1 to 32 simulators
 
 The same game, minibatch of 32, replay ratio, learning rate and interval of target copies, ε at
 0.01, timed once learning is under way, on an otherwise idle machine. The contenders run in
-processes of their own that take turns, 96 frames each while the others wait: all see the same
+processes of their own that take turns, 384 frames each while the others wait: all see the same
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
-as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,000
+as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,144
 with: until a run has freed a large block of memory, the C library of Linux gives an update's memory
 back to the system after each, and page faults are timed that a run of hours hardly has.
 
@@ -35,15 +35,15 @@ import tyro
 from machine import cpu_name
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "algorithms"))
-TURN = 96  # frames: whole steps of 1, 2, 4 and 8 simulators
+TURN = 384  # frames: whole steps of 1 to 32 simulators
 FILLED = 5_000  # frames before learning starts
-WARM_UP = 63 * TURN  # frames, the last 1,000 with learning
+WARM_UP = 16 * TURN  # frames, the last 1,144 with learning
 
 
 @dataclasses.dataclass
 class Args:
     frames: int = 2_000
-    """frames of each contender that are timed, in whole turns of 96"""
+    """frames of each contender that are timed, in whole turns of 384"""
     env_id: str = "PongNoFrameskip-v4"
     """game"""
     parallel: bool = False
@@ -276,7 +276,8 @@ def choose_precision() -> str:
     import dqn_atari
 
     torch.set_flush_denormal(True)
-    return dqn_atari.choose_precision(dqn_atari.Args(device="cpu"))
+    q_network = dqn_atari.QNetwork(4, 84, 84, 6).to(memory_format=torch.channels_last)
+    return dqn_atari.choose_precision(dqn_atari.Args(device="cpu"), q_network, (4, 84, 84))
 
 
 def compare_replay_ratios(args: Args) -> None:
@@ -297,15 +298,17 @@ def compare_replay_ratios(args: Args) -> None:
 
 
 def compare_simulators(args: Args, times: dict[str, float]) -> None:
-    """dqn_atari_parallel.py with 1 to 8 simulators, and with two processes of 4."""
+    """dqn_atari_parallel.py with 1 to 32 simulators, and with two processes of 4."""
     precision = in_a_process(choose_precision)
     same = {"agent_update_frequency": 4}
     chosen = same | {"precision": precision}
     contenders = {"dqn_atari.py": (ours, chosen)}
-    for n in (1, 2, 4, 8):
+    for n in (1, 2, 4, 8, 16, 32):
         flags = chosen | {"num_simulators": n, "ranks": 1}
         contenders[f"dqn_atari_parallel.py, {n} simulators"] = (ours_parallel, flags)
-        contenders[f"Stable-Baselines3, {n} environments"] = (stable_baselines3, same | {"envs": n})
+        if n <= 8:  # each of its environments takes hundreds of megabytes
+            sb3 = stable_baselines3, same | {"envs": n}
+            contenders[f"Stable-Baselines3, {n} environments"] = sb3
     flags = chosen | {"num_simulators": 4, "ranks": 2}
     contenders["dqn_atari_parallel.py, 2 ranks of 4"] = (ours_parallel, flags)
     found = side_by_side(args, contenders)

@@ -160,8 +160,7 @@ def test_first_flags_are_table_3():
     assert TABLE_3.split() == [text for f in first for text in (f.name, str(f.default))]
 
 
-@pytest.mark.parametrize("frame, epsilon", [(0, 1.0), (100_000, 0.901), (500_000, 0.505),
-                                            (1_000_000, 0.01), (5_000_000, 0.01)])
+@pytest.mark.parametrize("frame, epsilon", [(0, 1), (10**5, 0.901), (10**6, 0.01), (10**7, 0.01)])
 def test_epsilon(frame, epsilon):
     assert dqn.epsilon_at(frame, dqn.Args()) == pytest.approx(epsilon, abs=1e-12)
 
@@ -247,8 +246,7 @@ def test_actions_are_four_directions_and_fire_when_centred():
 def test_no_ops_are_0_to_30_from_the_seed():
     def numbers(count: int, seed: int, **flags) -> list[int]:
         env = environment(False, seed=seed, **flags)
-        ale = env.unwrapped.ale
-        return [(env.reset(), ale.getEpisodeFrameNumber())[1] for _ in range(count)]
+        return [(env.reset(), env.unwrapped.ale.getEpisodeFrameNumber())[1] for _ in range(count)]
 
     first = numbers(150, 1)
     assert (min(first), max(first), len(set(first)) > 25) == (0, 30, True)
@@ -424,7 +422,8 @@ def test_bfloat16_only_where_it_is_quicker_by_a_clear_margin(monkeypatch, bfloat
     seconds, seen, update = {"float32": 1.0, "bfloat16": bfloat16}, [], dqn.update
     monkeypatch.setattr(dqn, "update", lambda *all: seen.append(all[-1]) or update(*all))
     monkeypatch.setattr(dqn.timeit, "timeit", lambda work, **_: (work(), seconds[seen[-1]])[1])
-    assert dqn.choose_precision(dqn.Args(device="cpu", optimizer_minibatch_size=2)) == choice
+    q_network, shape = dqn.QNetwork(4, 36, 36, 6), (4, 36, 36)
+    assert dqn.choose_precision(dqn.Args(device="cpu"), q_network, shape) == choice
 
 
 class Scripted(gym.Env):

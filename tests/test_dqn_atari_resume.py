@@ -171,7 +171,7 @@ def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path, monkeyp
 
 def test_the_precision_and_the_threads_of_a_run_are_kept(tmp_path, monkeypatch):
     chosen, seen, update = ["bfloat16"], [], dqn.update
-    monkeypatch.setattr(dqn, "choose_precision", lambda args: chosen.pop())  # once
+    monkeypatch.setattr(dqn, "choose_precision", lambda *_: chosen.pop())  # once
     monkeypatch.setattr(dqn, "update", lambda *all: (
         seen.append((all[-1], torch.get_num_threads())), update(*all))[1])
     code = run(runs_dir=tmp_path, precision="auto", threads=0, optimizer_name="RMSprop",
@@ -271,7 +271,8 @@ def test_contradictions_are_refused(stopped):
     "--env-id NoSuchGame-v0", "--env-id CartPole-v1", "--env-id FrozenLake-v1", "--seed -1",
     "--agent-update-frequency -4", "--agent-replay-buffer-initial 0", "--threads -1",
     "--agent-epsilon-greedy-epsilon-final 2", "--agent-discount-factor -0.5",
-    "--optimizer-learning-rate nan", "--agent-replay-buffer-initial 351"])
+    "--optimizer-learning-rate nan", "--agent-replay-buffer-initial 351",
+    "--environment-state-width 35", f"--device {'mps' if torch.cuda.is_available() else 'cuda'}"])
 def test_bad_input_is_refused_in_one_line(flags, tmp_path):
     name, value = flags.split()
     code = run(**{name[2:]: value, "runs_dir": tmp_path / "runs"})
