@@ -35,9 +35,9 @@ environment_state_height 84  environment_state_width 84  agent_history_length 4
 agent_action_repeat 4  agent_update_frequency 1  agent_discount_factor 0.99
 agent_epsilon_greedy_epsilon_initial 1.0  agent_epsilon_greedy_epsilon_final 0.01
 agent_epsilon_greedy_annealing 1000000  agent_epsilon_greedy_epsilon_evaluation 0.05
-agent_replay_buffer_initial 100000  agent_replay_buffer_maximum_length 1000000
-optimizer_name Adam  optimizer_minibatch_size 32
-optimizer_q_network_parameter_update_interval_frames 1000  optimizer_learning_rate 0.0001
+agent_replay_buffer_initial 100000  agent_replay_buffer_maximum_length 1000000  optimizer_name Adam
+optimizer_minibatch_size 32  optimizer_q_network_parameter_update_interval_frames 1000
+optimizer_learning_rate 0.0001
 """
 decode = dqn.ReplayMemory(1, (4, 84, 84), "cpu").decode
 

@@ -171,16 +171,17 @@ def test_trained_on_is_trained_longer_from_the_start(straight, tmp_path, monkeyp
 
 def test_the_precision_and_the_threads_of_a_run_are_kept(tmp_path, monkeypatch):
     chosen, seen, update = ["bfloat16"], [], dqn.update
-    monkeypatch.setattr(dqn, "choose_precision", lambda *_: chosen.pop())  # once
-    monkeypatch.setattr(dqn, "update", lambda *all: (
-        seen.append((all[-1], torch.get_num_threads())), update(*all))[1])
+    monkeypatch.setattr(dqn, "choose_precision", lambda args, q_network, shape: (
+        q_network.head.bias.data.fill_(7), chosen.pop())[1])  # once; it has a copy to spoil
+    monkeypatch.setattr(dqn, "update", lambda *all: (seen.append((
+        all[-1], torch.get_num_threads(), all[0].head.bias.max() < 1)), update(*all))[1])
     code = run(runs_dir=tmp_path, precision="auto", threads=0, optimizer_name="RMSprop",
                environment_train_frames_max=200, each_frame=stop_at(170, signal.SIGTERM))
     args = json.loads((only(tmp_path) / "args.json").read_text())
     assert (code, args["precision"], args["threads"], args["device"]) == (143, "bfloat16", 1, "cpu")
     torch.set_num_threads(2)  # another machine
     assert run("--resume", only(tmp_path)) == 0
-    assert set(seen) == {("bfloat16", 1)} and len(seen) == 13
+    assert seen == [("bfloat16", 1, True)] * 13
 
 
 @pytest.mark.parametrize("game", ["Qbert", "Tetris", "Pong", "Breakout"])
@@ -230,7 +231,6 @@ def test_two_processes_cannot_write_one_run(straight, tmp_path):
 
 class Hostile(str):
     """A path. Unpickling it makes the file."""
-
     def __reduce__(self):
         return open, (str(self), "w")
 
