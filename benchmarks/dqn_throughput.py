@@ -42,7 +42,7 @@ WARM_UP = 16 * TURN  # frames, the last 1,144 with learning
 
 @dataclasses.dataclass
 class Args:
-    frames: int = 2_000
+    frames: int = 5_760
     """frames of each contender that are timed, in whole turns of 384"""
     env_id: str = "PongNoFrameskip-v4"
     """game"""
