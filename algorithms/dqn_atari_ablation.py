@@ -82,9 +82,9 @@ class Args:
     environment_frames_to_maxpool: int = 2
     """last emulator frames whose pixelwise maximum is the screen"""
     environment_state_height: int = 84
-    """height of a frame, pixels"""
+    """height of a frame, pixels, at least 36"""
     environment_state_width: int = 84
-    """width of a frame, pixels"""
+    """width of a frame, pixels, at least 36"""
     agent_history_length: int = 4
     """frames in a state"""
     agent_action_repeat: int = 4
@@ -156,12 +156,12 @@ def read_args() -> Args:
         frames = max(args.environment_train_frames_max, defaults.environment_train_frames_max)
         if args != dataclasses.replace(defaults, environment_train_frames_max=frames):
             raise SystemExit("error: --resume allows a larger --environment-train-frames-max alone")
-    # ε and γ are in [0, 1], a screen has at least the 36 lines and columns that Table 2's filters
-    # need, those named may be 0, all others are above 0; NaN is refused, too.
+    # ε and γ are in [0, 1], those named may be 0, a frame's sides are at least the 36 pixels that
+    # Table 2's filters need, all others are above 0; NaN is refused, too.
     for name, value in vars(args).items():
         share = "epsilon_greedy_epsilon" in name or name == "agent_discount_factor"
-        zero = share or name in ("seed", "threads", "environment_no_op_max")
-        low = 0 if zero else 36 if "_state_" in name else 1e-9
+        low = 0 if share or name in ("seed", "threads", "environment_no_op_max") else 1e-9
+        low = 36 if "_state_" in name else low
         if type(value) in (int, float) and not low <= value <= (1 if share else 2**31):
             raise SystemExit(f"error: --{name.replace('_', '-')} cannot be {value}")
     if args.agent_replay_buffer_initial > args.agent_replay_buffer_maximum_length:
@@ -187,7 +187,7 @@ class JoystickActions(gym.ActionWrapper):
     def __init__(self, env: gym.Env):
         super().__init__(env)
         minimal = env.unwrapped.get_action_meanings()
-        self.meanings = [x for x in minimal if x in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
+        self.meanings = [name for name in minimal if name in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
         self.indices = [minimal.index(name) for name in self.meanings]
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 

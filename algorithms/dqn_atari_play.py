@@ -102,7 +102,7 @@ class JoystickActions(gym.ActionWrapper):
     def __init__(self, env: gym.Env):
         super().__init__(env)
         minimal = env.unwrapped.get_action_meanings()
-        self.meanings = [x for x in minimal if x in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
+        self.meanings = [name for name in minimal if name in "NOOP FIRE UP RIGHT LEFT DOWN".split()]
         self.indices = [minimal.index(name) for name in self.meanings]
         self.action_space = gym.spaces.Discrete(len(self.meanings))
 
