@@ -18,8 +18,8 @@ Deviations
     A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2.
     Every evaluation starts from the values of the policies before it, as §4.2 suggests. Each policy
     is also evaluated from V = 0, to show how many sweeps that saves.
-    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
-    has no value (it may never end, at discount 1) is an error.
+    §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
+    has no value (at discount 1 it may collect for ever) is an error.
 """
 
 import itertools
@@ -47,7 +47,7 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; replaces --model"""
     env_kwargs: str = ""
     """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
@@ -259,7 +259,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 def main(args: Args) -> None:
     """Try every policy of the MDP that the flags name, and report the best."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,)
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) or 1, 0, …
     policy, V, tried = exhaustive_search(P, R, start, args)
     for i, (value, sweeps, sweeps_from_0) in enumerate(tried[:10], start=1):
         print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")

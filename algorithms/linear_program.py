@@ -15,7 +15,7 @@ Measured
     The first command prints V* = (11, 1, 4), the V* of value iteration.
 
 Deviations
-    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
+    §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
     At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
     to and fro for ever.
 """
@@ -42,7 +42,7 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; replaces --model"""
     env_kwargs: str = ""
     """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
@@ -96,7 +96,7 @@ def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
     bounds = [(0 if idle.any() else None, None) for idle in idle_actions(P, R).T]  # (S, 2)
     program = optimize.linprog(np.ones(len(bounds)), A, b, bounds=bounds, options=tolerances)
     # Infeasible: no finite V is large enough, V* is +∞ somewhere. Unbounded: V can fall without
-    # limit, V* is -∞ somewhere.
+    # limit, V* is -∞ somewhere, or there is none: rewards of -1 and 1 in turns for ever.
     if program.x is None:
         raise SystemExit(f"error: V* is not found: {program.message.splitlines()[0]}")
     return program.x + 0.0, int(program.nit)  # (S,); -0.0 becomes 0.0

@@ -11,14 +11,14 @@ By the linear system of Equations 2 and 3, and iteratively.
 Run it
     python algorithms/policy_evaluation.py                    # π1, π2, π3 of §3.2 and their tables
     python algorithms/policy_evaluation.py --policy "s0=a2 s1=a1 s2=a2"
-    python algorithms/policy_evaluation.py --env-id FrozenLake-v1     # the first action everywhere
+    python algorithms/policy_evaluation.py --env-id FrozenLake-v1     # always left: V = 0
     python algorithms/policy_evaluation.py --model my_mdp.json --discount 0.95
 
 Measured
     The first command prints V(s0) = 11, 9 and 111/11, and V(s2) = 41/11 for π3.
 
 Deviations
-    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
+    §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
     At discount 1 V is 0 where nothing more is collected (rewards below 1e-9 count as none); a
     policy that may collect for ever has no value. V is undefined where the policy never comes.
 """
@@ -48,7 +48,7 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; replaces --model"""
     env_kwargs: str = ""
     """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0
@@ -288,7 +288,8 @@ def main(args: Args) -> None:
         # every step goes backwards, they are those that may reach the start.
         rows = policy * len(model) + np.arange(len(model))  # (S,) of P: a·S + s
         reached = may_reach(P[rows].T, start > 0)  # (S,)
-        # Where π is -1, `rows` has a row of the last action; to reach such a state is an error.
+        # Where π is -1, -S + s counts from the end: a row of the last action. To reach such a
+        # state is an error.
         if policy[reached].min() < 0:
             raise SystemExit("error: --policy comes to a state for which it names no action")
         policy = np.where(reached, policy, -1)  # (S,)

@@ -20,11 +20,11 @@ Deviations
     An action is changed only for a gain of more than 1e-9 · (1 + |V(s)|): of actions that tie, an
     argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed as the Bellman
     residual.
-    At discount 1 an action with which the agent can stay idle for ever has a Q of 0 at least: with
-    V = -9 to go to itself for nothing has Q = 0 + V = -9, and would only tie.
+    At discount 1 an action with which the agent can stay idle for ever has a Q of 0 at least. Where
+    V(s) = -9, Equation 29 gives it only 0 + V(s) = -9, a tie; so a table may have 1·[0 + -9] = 0.
     The first policy is not random. At discount 1 a policy that collects for ever has no value, so
     the first one ends, or stays somewhere for nothing; at another discount it is the first action.
-    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
+    §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
 import json
@@ -51,7 +51,7 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; replaces --model"""
     env_kwargs: str = ""
     """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0

@@ -5,7 +5,7 @@
 #   "matplotlib>=3.9",
 # ]
 # ///
-"""Tabular Q-learning: a robot learns GridWorld without its model (§5.2, Algorithm 5, Eq. 34-36).
+"""Tabular Q-learning: a robot learns GridWorld without its model (§5.2, Algorithm 5, Eq. 34-37).
 
 It prints and draws Figure 9, the Q-values of each cell, and Figure 10, the policy. Beside them is
 Q* by value iteration (§4.3): the model is known to the judge, never to the learner.
@@ -63,7 +63,7 @@ class Args:
     Q(s,a) is the expected sum of rewards from state s on, if the first action is a."""
 
     episodes: int = 1000
-    """episodes to learn from (Figure 9: 1000)"""
+    """episodes to learn from (Figure 9: 1000 interactions)"""
     discount: float = 1.0
     """γ in [0, 1] (Equation 34 is undiscounted: 1)"""
     learning_rate: float = 0.7
@@ -201,7 +201,7 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
                 a = ties[int(random() * len(ties))]
             s_next, r, terminated, truncated, _ = env.step(a)
 
-            # y = r if s' is terminal (Equation 36), else r + γ max_a' Q(s',a')
+            # y = r if s' is terminal, else r + γ max_a' Q(s',a')   (Equations 36, 37)
             # Easy to get wrong: not r alone where a time limit cut the episode short (truncated):
             # there the world would have gone on.
             y = r if terminated else r + args.discount * max(Q[s_next])

@@ -18,14 +18,14 @@ Measured
     at discount 1: V(0) = 0.8235294117, 14/17, after 993 sweeps.
 
 Deviations
-    The lecture is undiscounted; here a reward t steps later counts γ^t (--discount).
+    §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
     At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
     to and fro for ever.
     At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
     only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8, since V_0(s1) = 0. From then
     on to stay is worth 8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. Or rewards cancel,
-    as -1 from s0 to s1 and 1 back, and V_i swings for ever. Then the script exits with an error;
-    policy_iteration.py solves both.
+    as -1 from s0 to s1 and 1 back, beside an exit from s0 that costs 5, and V_i swings for ever.
+    Then the script exits with an error; policy_iteration.py solves both.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -54,7 +54,7 @@ class Args:
     model: Path | None = None
     """JSON file: {state: {action: [[probability, next state, reward, terminated], ...]}}"""
     env_id: str = ""
-    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; not with --model"""
+    """Gymnasium environment with a model (unwrapped.P), such as FrozenLake-v1; replaces --model"""
     env_kwargs: str = ""
     """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
     discount: float = 1.0

@@ -72,7 +72,7 @@ class Args:
 
     slip_probability: float = 0.2
     """chance that a move slips, half to each side (0: Figure 3, left; in (3,2) the default policy
-    then walks into the wall for ever, which has no value at discount 1)"""
+    then walks into the wall for ever, which is refused at discount 1)"""
     step_reward: float = -0.025
     """reward of every step that does not end the episode"""
 

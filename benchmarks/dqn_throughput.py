@@ -18,6 +18,7 @@ when it is old: moments of half of the linear layer's units denormal, with and w
 flushes them. Runs keep the frames per second of their first and last tenth in test.json.
 """
 
+import atexit
 import contextlib
 import copy
 import dataclasses
@@ -83,9 +84,10 @@ def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
         dqn.tqdm = Bar
     with tempfile.TemporaryDirectory() as folder:
         dqn.main(dqn.Args(
-            env_id=args.env_id, device="cpu", runs_dir=folder,
-            environment_train_frames_max=WARM_UP + args.frames, agent_replay_buffer_initial=FILLED,
-            agent_epsilon_greedy_annealing=FILLED, environment_test_frames=1, **flags))
+            env_id=args.env_id, device="cpu", runs_dir=folder, agent_replay_buffer_initial=FILLED,
+            environment_train_frames_max=WARM_UP + args.frames, environment_test_frames=1,
+            environment_evaluation_interval_episodes=10**9,  # an evaluation has a bar of its own
+            agent_epsilon_greedy_annealing=FILLED, **flags))
 
 
 def ours(args: Args, turns: Turns, **flags) -> None:
@@ -147,7 +149,7 @@ def run(name: str, contender: tuple, args: Args, mine, following, results) -> No
     """What the process of a contender does."""
     function, flags = contender
     turns = Turns(mine, following)
-    with open(os.devnull, "w") as nowhere:
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
         with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
             function(args, turns, **flags)
     results.put((name, turns.seconds[: args.frames // TURN]))
@@ -166,14 +168,13 @@ def side_by_side(args: Args, contenders: dict[str, tuple]) -> dict[str, float]:
     ]
     for child in children:
         child.start()
+        atexit.register(child.kill)  # else, after an error, they wait for one another for ever
     found = {}
     while len(found) < len(children):
         with contextlib.suppress(queue.Empty):
             name, seconds = results.get(timeout=1)
             found[name] = TURN / np.mean(seconds)
-        if any(child.exitcode for child in children):  # the others would wait for it for ever
-            for child in children:
-                child.kill()
+        if any(child.exitcode for child in children):
             raise SystemExit("error: a contender has failed")
     for child in children:
         child.join()

@@ -160,7 +160,7 @@ def main(args: Args) -> None:
         for what in args.solves:
             found = in_turns(args.limit, what, size)
             for who, one in zip(("", "QuantEcon "), found, strict=True):
-                text = f"given up after {args.limit:g} s"
+                text = f"given up after {args.limit:g} s, or out of memory"
                 if one:
                     (seconds, iterations, _), memory = one
                     text = f"{seconds:.3g} s, {iterations} iterations, {memory:.2f} GB"
