@@ -1,5 +1,6 @@
 """dqn_atari_ablation.py: without its switches it is dqn_atari.py, each switch does one thing."""
 
+import copy
 import difflib
 import itertools
 from pathlib import Path
@@ -10,17 +11,15 @@ import dqn_atari_parallel as parallel
 import numpy as np
 import pandas as pd
 import pytest
+import test_dqn_atari
 import torch
 from test_dqn_atari import weights
 from test_suite import ALGORITHMS, definitions
-from torch import nn
 
-SHORT = {
-    "env_id": "BreakoutNoFrameskip-v4", "environment_train_frames_max": 700, "threads": 1,
-    "precision": "float32", "agent_replay_buffer_initial": 200, "agent_update_frequency": 4,
-    "agent_replay_buffer_maximum_length": 300, "environment_test_frames": 300,
-    "environment_evaluation_episodes": 1, "environment_evaluation_interval_episodes": 4,
-    "optimizer_q_network_parameter_update_interval_frames": 100}
+SHORT = test_dqn_atari.SHORT | dict(
+    environment_train_frames_max=700, environment_evaluation_interval_episodes=4,
+    environment_evaluation_episodes=1, agent_replay_buffer_maximum_length=300,
+    agent_replay_buffer_initial=200, optimizer_q_network_parameter_update_interval_frames=100)
 
 
 @pytest.fixture
@@ -29,12 +28,9 @@ def run(tmp_path, monkeypatch):
 
     def call(script, **flags) -> tuple[Path, list]:
         calls, update = [], script.update
-
-        def seen(q_network, target_network, optimizer, minibatch, *rest):
-            calls.append((q_network, target_network, minibatch))
-            return update(q_network, target_network, optimizer, minibatch, *rest)
-
-        monkeypatch.setattr(script, "update", seen)
+        monkeypatch.setattr(script, "update", lambda q_network, target_network, *rest: (
+            calls.append((q_network, target_network, rest[1])),
+            update(q_network, target_network, *rest))[1])
         runs = tmp_path / f"{script.__name__}{len(list(tmp_path.iterdir()))}"
         script.main(script.Args(**SHORT | flags, runs_dir=str(runs)))
         (run_dir,) = runs.iterdir()
@@ -86,7 +82,7 @@ def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkey
     ends = [n for n in stored_when if n >= 200 and n % 4 == 0]  # past 300 the memory wraps
     assert len(calls) == len(ends)
     for (_, _, minibatch), end in zip(calls, ends, strict=True):
-        last = zip(*stored[end - 32 : end], strict=True)
+        last = zip(*stored[end - 8 : end], strict=True)
         for column, expected in zip(minibatch, last, strict=True):
             tensors = [torch.as_tensor(value) for value in expected]
             assert torch.equal(column, torch.stack(tensors).to(column.dtype))
@@ -96,16 +92,13 @@ def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkey
 def test_initialization(name):
     torch.manual_seed(1)
     q_network = ablation.QNetwork(4, 84, 84, 4)
-    before = [layer.weight.clone() for layer in q_network.layers if isinstance(layer, nn.Conv2d)]
-    others = q_network.layers[7].weight.clone(), q_network.layers[0].bias.clone()
+    before = copy.deepcopy(q_network.state_dict())
     ablation.initialize(q_network, name)
-    assert torch.equal(others[0], q_network.layers[7].weight)
-    assert torch.equal(others[1], q_network.layers[0].bias)
-    for i, old in zip((0, 2, 4), before, strict=True):
-        weight = q_network.layers[i].weight.detach().flatten(1)  # (filters, inputs)
-        if name == "default":
-            assert torch.equal(weight, old.flatten(1))
-        elif name == "he":
+    changed = {key: θ for key, θ in q_network.state_dict().items() if not θ.equal(before[key])}
+    convolutions = {"layers.0.weight", "layers.2.weight", "layers.4.weight"}
+    assert changed.keys() == (set() if name == "default" else convolutions)
+    for weight in (θ.flatten(1) for θ in changed.values()):  # (filters, inputs)
+        if name == "he":
             assert weight.std().item() == pytest.approx((2 / weight.shape[1]) ** 0.5, rel=0.05)
         else:
             assert torch.allclose(weight @ weight.T, torch.eye(len(weight)), atol=1e-4)

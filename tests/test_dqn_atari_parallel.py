@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import itertools
 import json
 import os
 import signal
@@ -14,17 +15,17 @@ import dqn_atari as serial
 import dqn_atari_parallel as parallel
 import numpy as np
 import pytest
+import test_dqn_atari
 import torch
 from conftest import ALGORITHMS
 from gymnasium.wrappers import TimeLimit
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 PYTHON = sys.executable, ALGORITHMS / "dqn_atari_parallel.py"
-SHORT = dict(device="cpu", env_id="BreakoutNoFrameskip-v4", agent_replay_buffer_initial=100,
-             agent_replay_buffer_maximum_length=2000, optimizer_minibatch_size=8,
-             agent_update_frequency=4, environment_test_frames=20,
-             environment_evaluation_interval_episodes=5,
-             optimizer_q_network_parameter_update_interval_frames=10**6)
+SHORT = {name: value for name, value in test_dqn_atari.SHORT.items() if name != "threads"} | dict(
+    device="cpu", environment_train_frames_max=10**7, environment_test_frames=20,
+    environment_evaluation_interval_episodes=1, agent_replay_buffer_maximum_length=2000,
+    optimizer_q_network_parameter_update_interval_frames=10**6)
 make_simulator = parallel.make_simulator
 
 
@@ -40,13 +41,9 @@ def make_capped_simulator(*arguments):
 class Run:
     """main() in this process: memory, no-op generators at the start, updates, acting, tests."""
 
-    def __init__(self, folder: Path, **flags):
+    def __init__(self, folder: Path, precision="float32", **flags):
         run, self.updates, self.steps, self.acted, self.evaluated = self, [], [], [], []
         make_memory, make_envs = parallel.ReplayShare, parallel.AsyncVectorEnv
-
-        def memory(*arguments):
-            run.memory = make_memory(*arguments)
-            return run.memory
 
         class Bar(parallel.tqdm):
             def update(self, n=1):
@@ -59,11 +56,12 @@ class Run:
 
         def update(q_network, target_network, optimizer, *rest):
             before = q_network.head.weight.detach().clone()
+            assert (optimizer.defaults["lr"], *rest[1:]) == (2e-4, 0.9, precision)
             result = serial.update(q_network, target_network, optimizer, *rest)
             run.updates.append({
-                "frames": len(run.memory), "s": rest[0][0],
+                "frames": len(run.memory), "s": rest[0][0], "before": before,
                 "target": target_network.head.weight.clone(),
-                "before": before, "after": q_network.head.weight.detach().clone(),
+                "after": q_network.head.weight.detach().clone(),
                 "adam": int(next(iter(optimizer.state.values()))["step"])})
             return result
 
@@ -77,13 +75,15 @@ class Run:
 
         greedy = parallel.epsilon_greedy_batch
         with pytest.MonkeyPatch.context() as patch:
-            spies = dict(ReplayShare=memory, AsyncVectorEnv=envs, tqdm=Bar, update=update,
+            spies = dict(AsyncVectorEnv=envs, tqdm=Bar, update=update,
                          make_simulator=make_capped_simulator, epsilon_greedy_batch=act,
-                         evaluate=evaluate)
+                         evaluate=evaluate, ReplayShare=lambda *arguments: setattr(
+                             run, "memory", make_memory(*arguments)) or run.memory)
             for name, spy in spies.items():
                 patch.setattr(parallel, name, spy)
-            parallel.main(parallel.Args(**(SHORT | {"runs_dir": str(folder)} | flags)))
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+            patch.setattr(signal, "signal", lambda *_: None)  # Ctrl-C still ends pytest
+            flags = SHORT | dict(runs_dir=str(folder), precision=precision) | flags
+            parallel.main(parallel.Args(**flags))
         self.result = json.loads(next(folder.glob("*/test.json")).read_text())
 
 
@@ -94,7 +94,9 @@ def read_checkpoint(run_dir: Path) -> dict:
 @pytest.mark.parametrize("simulators", [1, 3, 4])
 def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     run = Run(tmp_path, num_simulators=simulators, environment_train_frames_max=400 * simulators,
-              agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400)
+              agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400,
+              environment_evaluation_interval_episodes=5)
+    decode = serial.ReplayMemory(1, (4, 44, 52), "cpu").decode
     s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
     assert len({str(rng.bit_generator.state) for rng in run.no_op_rngs}) == simulators
     assert torch.equal(torch.cat([states for _, states, _ in run.acted]), s)
@@ -103,9 +105,9 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
         env = serial.FrameHistory(capped(serial.make_env(serial.Args(**SHORT), rng, True)), 4)
         state, _ = env.reset(seed=1 + i)
         for j in range(i, len(s), simulators):
-            assert torch.equal(s[j], run.memory.decode([state])[0]), (i, j)
+            assert torch.equal(s[j], decode([state])[0]), (i, j)
             state, reward, terminated, truncated, info = env.step(int(a[j]))
-            assert torch.equal(s_next[j], run.memory.decode([state])[0]), (i, j)
+            assert torch.equal(s_next[j], decode([state])[0]), (i, j)
             assert (float(r[j]), bool(terminal[j])) == (reward, terminated), (i, j)
             if "episode" in info:
                 games.append((j - i + simulators, info["episode"]["r"]))
@@ -136,11 +138,11 @@ def test_batch_of_actions_is_greedy_for_each_state():
     assert greedy.all(axis=1).mean() < 0.1  # each simulator draws for itself
 
 
-@pytest.mark.parametrize(("simulators", "frequency"), [(3, 4), (4, 1)])
-def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency):
+@pytest.mark.parametrize("simulators,frequency,precision", [(3, 4, "bfloat16"), (4, 1, "float32")])
+def test_updates_and_target_copies_are_exact(tmp_path, simulators, frequency, precision):
     run = Run(tmp_path, num_simulators=simulators, agent_update_frequency=frequency,
               environment_train_frames_max=240, agent_replay_buffer_maximum_length=110,
-              optimizer_q_network_parameter_update_interval_frames=50)
+              optimizer_q_network_parameter_update_interval_frames=50, precision=precision)
     frames = range(simulators, 240 + simulators, simulators)
     first = min(n for n in frames if n >= 100) // frequency  # it has no update yet
     assert run.steps == [(simulators, n, max(0, n // frequency - first)) for n in frames]
@@ -178,7 +180,7 @@ if __name__ == "__main__":
 
 
 def wait_until(condition):
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 300
     while not (value := condition()):
         assert time.monotonic() < limit
         time.sleep(0.05)
@@ -193,9 +195,9 @@ class Command:
             pytest.skip("finds processes in /proc")
         self.mark, self.folder = f"MARK={time.time_ns()}", folder
         flags = SHORT | dict(runs_dir="runs", checkpoint_interval_minutes=0.005, num_simulators=2)
-        command = [*command, *(f"--{k.replace('_', '-')}={v}" for k, v in flags.items())]
+        command = [*map(str, command), *test_dqn_atari.as_flags(flags)]
         self.process = subprocess.Popen(
-            list(map(str, command)), cwd=folder, env=os.environ | dict([self.mark.split("=")]),
+            command, cwd=folder, env=os.environ | dict([self.mark.split("=")]),
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8")
 
     def run_dir(self) -> Path:
@@ -206,35 +208,46 @@ class Command:
         for path in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):  # it has ended
                 if self.mark.encode() in (path / "environ").read_bytes():  # empty for a zombie
-                    found.append(int(path.name))
-        return found
+                    started = (path / "stat").read_text().rpartition(")")[2].split()[19]
+                    found.append((int(started), int(path.name)))
+        return [pid for _, pid in sorted(found)]  # the oldest first
 
     def end(self) -> tuple[int, str, str]:
         """Wait for the end of all its processes: exit code, output, errors."""
-        output, errors = self.process.communicate(timeout=60)
+        output, errors = self.process.communicate(timeout=300)
         wait_until(lambda: not self.processes())
         return self.process.returncode, output, errors
 
 
-def start_two_ranks(folder: Path) -> tuple[Command, Path, list, list]:
+def start_two_ranks(folder: Path, *flags) -> tuple[Command, Path, list, list]:
     """A run of two ranks with a checkpoint of some updates, and what each saw in its first 8."""
     (folder / "rank.py").write_text(RANK, encoding="utf-8")
-    torchrun = Path(sys.executable).with_name("torchrun"), "--nproc-per-node", 2
-    run = Command(folder, *torchrun, folder / "rank.py", ALGORITHMS)
+    torchrun = Path(sys.executable).with_name("torchrun"), "--standalone", "--nproc-per-node", 2
+    for file in folder.glob("log?"):
+        file.unlink()
+    run = Command(folder, *torchrun, folder / "rank.py", ALGORITHMS, *flags)
     run_dir, files = run.run_dir(), [folder / "log0", folder / "log1"]
     wait_until(lambda: all(map(Path.exists, files)))
     wait_until(lambda: read_checkpoint(run_dir)["counters"]["updates"])
     return run, run_dir, *[torch.load(file, weights_only=True) for file in files]
 
 
-def test_ranks_have_one_θ_and_the_mean_gradient_and_one_that_is_killed_ends_both(tmp_path):
-    run, run_dir, first, second = start_two_ranks(tmp_path)
+def test_ranks_stop_together_resume_and_have_one_θ_and_the_mean_gradient(tmp_path):
+    run, run_dir, _, second = start_two_ranks(tmp_path)
+    os.kill(second[0]["pid"], signal.SIGTERM)  # a signal to one stops both
+    code, output, errors = run.end()
+    assert code != 0 and "to go on: --resume" in output and "has died" not in errors
+    saved = read_checkpoint(run_dir)
+    run, _, first, second = start_two_ranks(tmp_path, "--resume", run_dir)
+    assert all(map(torch.equal, first[0]["θ"], saved["q_network"].values()))
     os.kill(second[0]["pid"], signal.SIGKILL)
     code, _, errors = run.end()
     assert code != 0 and "error: a process of the run has died" in errors
-    counters = read_checkpoint(run_dir)["counters"]  # totals over the ranks
-    assert counters["updates"] == (counters["frames"] - 100) // 4 > 0
-    networks = [parallel.QNetwork(4, 84, 84, 4) for _ in range(2)]
+    counters = {"frames": 0, "updates": 0}, saved["counters"], read_checkpoint(run_dir)["counters"]
+    for old, new in itertools.pairwise(counters):  # totals over the ranks; 100 frames fill 𝒟
+        frames = max(0, new["frames"] - old["frames"] - 100)
+        assert new["updates"] - old["updates"] == frames // 4
+    networks = [parallel.QNetwork(4, 44, 52, 4) for _ in range(2)]
     for mine, yours in zip(first, second, strict=True):
         for name in ("θ", "gradient", "target"):
             assert all(map(torch.equal, mine[name], yours[name])), name
@@ -245,22 +258,15 @@ def test_ranks_have_one_θ_and_the_mean_gradient_and_one_that_is_killed_ends_bot
             for parameter, value in zip(network.parameters(), mine[name], strict=True):
                 parameter.data = value
         still = torch.optim.SGD(networks[0].parameters(), lr=0.0)
-        parallel.update(*networks, still, both, 0.99, "float32")
+        parallel.update(*networks, still, both, 0.9, "float32")
         for parameter, gradient in zip(networks[0].parameters(), mine["gradient"], strict=True):
             torch.testing.assert_close(gradient, parameter.grad / 2, rtol=1e-4, atol=1e-5)
-
-
-def test_a_signal_to_one_rank_stops_both(tmp_path):
-    run, _, _, second = start_two_ranks(tmp_path)
-    os.kill(second[0]["pid"], signal.SIGTERM)
-    code, output, errors = run.end()
-    assert code != 0 and "to go on: --resume" in output and "has died" not in errors
 
 
 def test_killed_simulator_ends_the_run(tmp_path):
     run = Command(tmp_path, *PYTHON)
     run_dir = run.run_dir()
-    os.kill(max(run.processes()), signal.SIGKILL)  # simulators start last
+    os.kill(run.processes()[-1], signal.SIGKILL)  # simulators start last
     code, _, errors = run.end()
     assert code == 1 and "error: a process of the run" in errors and "Traceback" not in errors
     assert read_checkpoint(run_dir)["counters"]["frames"] > 0
@@ -268,9 +274,9 @@ def test_killed_simulator_ends_the_run(tmp_path):
 
 def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
     run = Command(tmp_path, *PYTHON)
-    run_dir = run.run_dir()
-    wait_until(lambda: read_checkpoint(run_dir)["counters"]["updates"])
-    for pid in sorted(run.processes(), reverse=True):  # Ctrl-C reaches all; here simulators first
+    run_dir, both = run.run_dir(), ("updates", "evaluations")
+    wait_until(lambda: all(map(read_checkpoint(run_dir)["counters"].get, both)))
+    for pid in reversed(run.processes()):  # Ctrl-C reaches all; here simulators first
         os.kill(pid, signal.SIGINT)
         time.sleep(0.2)
     code, output, _ = run.end()
@@ -286,6 +292,11 @@ def test_stopped_run_goes_on_after_its_memory_is_filled(tmp_path, monkeypatch):
         assert torch.equal(first[seen], saved[name]["head.weight"])
     counters = read_checkpoint(run_dir)["counters"]
     assert (counters["frames"], counters["updates"]) == (frames + 140, updates + (140 - 100) // 4)
+    assert counters["evaluations"][0]["frames"] <= frames  # what it knew is kept
+    saved["q_network"]["head.bias"][0] = torch.nan
+    torch.save(saved, run_dir / "checkpoint.pt")
+    with pytest.raises(SystemExit, match="NaN"):
+        Run(run_dir.parent, **flags)
     os.truncate(run_dir / "checkpoint.pt", 5000)
     with pytest.raises(SystemExit, match="cannot be resumed"):
         parallel.main(parallel.Args(**flags))

@@ -11,6 +11,7 @@ import dqn_atari as dqn
 import dqn_atari_play as play
 import numpy as np
 import pytest
+import test_dqn_atari
 import torch
 from PIL import Image
 
@@ -22,9 +23,8 @@ SEED, EPSILON, ACTIONS = 15, 0.8, ["NOOP", "FIRE", "RIGHT", "LEFT"]  # of Breako
 def episode(tmp_path_factory):
     """A game of a network that dqn_atari.py wrote, and its actions on the bare emulator."""
     runs, returned, whole = tmp_path_factory.mktemp("runs"), [], play.play
-    dqn.main(dqn.Args(env_id="ALE/Breakout-v5", environment_train_frames_max=1, threads=1,
-                      environment_test_frames=1, precision="float32", runs_dir=str(runs),
-                      environment_state_height=44, environment_state_width=52))
+    few = {"environment_train_frames_max": 1, "environment_test_frames": 1}
+    dqn.main(dqn.Args(**test_dqn_atari.SHORT | few, runs_dir=str(runs)))
     torch.set_flush_denormal(False)
     (path,) = runs.glob("*/q_network.pt")
     saved = torch.load(path, weights_only=True)
@@ -100,9 +100,8 @@ def test_panel_marks_the_best_and_the_taken_action(episode):
         row = {"action": ACTIONS[taken], "choice": choice, "reward": 0.0}
         q = 0.2 + 1e-6 * np.eye(4)[[best]]
         return np.array(next(play.pictures([row], q, episode.screens, play.load(episode.path)[1])))
-    def rows(picture: np.ndarray) -> np.ndarray:
-        return np.flatnonzero((picture != draw(0, 0)).any(axis=(1, 2)))
-    marks = [(rows(draw(0, a)), rows(draw(a, 0))) for a in (1, 2, 3)]  # the box is taller
+    marks = [[np.flatnonzero((draw(*moved) != draw(0, 0)).any(axis=(1, 2)))  # rows of the picture
+              for moved in ((0, a), (a, 0))] for a in (1, 2, 3)]  # the box is taller
     assert all(abs(dot.mean() - box.mean()) < 2 and len(box) > len(dot) for dot, box in marks)
     assert np.diff([dot.mean() for dot, _ in marks]).min() > 10
     assert (draw(0, 0) != draw(0, 0, "random")).any()

@@ -14,28 +14,24 @@ from pathlib import Path
 import dqn_atari as dqn
 import numpy as np
 import pytest
+import test_dqn_atari
 import torch
 from conftest import ALGORITHMS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 FRAMES = 460
-SHORT = {
-    "env-id": "BreakoutNoFrameskip-v4", "threads": 1, "precision": "float32",
-    "environment-state-height": 44, "environment-state-width": 52,  # a small network
-    "environment-train-frames-max": FRAMES, "environment-test-frames": 400,
-    "environment-evaluation-interval-episodes": 2, "environment-evaluation-episodes": 1,
-    "environment-checkpoint-interval-episodes": 2, "agent-update-frequency": 4,
-    "agent-replay-buffer-initial": 150, "agent-replay-buffer-maximum-length": 350,
-    "agent-epsilon-greedy-epsilon-evaluation": 0.5, "agent-epsilon-greedy-annealing": 400,
-    "optimizer-q-network-parameter-update-interval-frames": 70, "optimizer-minibatch-size": 8,
-    "checkpoint-interval-minutes": 0.00001}
+SHORT = test_dqn_atari.SHORT | dict(
+    environment_train_frames_max=FRAMES, environment_evaluation_interval_episodes=2,
+    environment_evaluation_episodes=1, environment_checkpoint_interval_episodes=2,
+    agent_replay_buffer_initial=150, agent_replay_buffer_maximum_length=350,
+    agent_epsilon_greedy_epsilon_evaluation=0.5, agent_epsilon_greedy_annealing=400,
+    optimizer_q_network_parameter_update_interval_frames=70, checkpoint_interval_minutes=0.00001)
 
 
 def run(*flags, each_frame=lambda frame: None, **changed):
     """The script in this process; each_frame(n) follows the n-th transition. The exit code."""
     if "--resume" not in flags:
-        changed = SHORT | {name.replace("_", "-"): value for name, value in changed.items()}
-        flags += tuple(text for name, value in changed.items() for text in (f"--{name}", value))
+        flags = *flags, *test_dqn_atari.as_flags(SHORT | changed)
     add = dqn.ReplayMemory.add
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["dqn_atari.py", *map(str, flags)])
@@ -89,7 +85,7 @@ def plain(value):
 def everything(run_dir: Path) -> dict:
     """All that a run leaves, but its clocks."""
     saved = torch.load(run_dir / "checkpoint.pt", weights_only=True)
-    replay = dqn.ReplayMemory(SHORT["agent-replay-buffer-maximum-length"], (4, 44, 52), "cpu")
+    replay = dqn.ReplayMemory(SHORT["agent_replay_buffer_maximum_length"], (4, 44, 52), "cpu")
     replay.load_state_dict(saved.pop("replay"))
     rows = [row.rsplit(",", 1)[0] for row in (run_dir / "evaluations.csv").read_text().splitlines()]
     test = json.loads((run_dir / "test.json").read_text())
@@ -142,8 +138,8 @@ def test_stopped_and_resumed_is_never_stopped(straight, tmp_path, frame, number)
 
 
 def test_killed_and_resumed_is_never_stopped(straight, tmp_path):
-    flags = [text for pair in SHORT.items() for text in (f"--{pair[0]}", pair[1])]
-    assert child(230, int(signal.SIGKILL), *flags, "--runs-dir", tmp_path).returncode == -9
+    flags = test_dqn_atari.as_flags(SHORT | {"runs_dir": tmp_path})
+    assert child(230, int(signal.SIGKILL), *flags).returncode == -9
     checkpoint = only(tmp_path) / "checkpoint.pt"
     assert torch.load(checkpoint, weights_only=True)["counters"]["frames"] == 200
     assert child(390, int(signal.SIGKILL), "--resume", only(tmp_path)).returncode == -9
@@ -201,8 +197,8 @@ def test_the_emulator_goes_on_where_it_was(game, tmp_path):
         return [state, reward, terminated, ale.getScreenRGB().tobytes(), ale.getRAM().tobytes(),
                 ale.getEpisodeFrameNumber(), *map(env.get_wrapper_attr, names)]
 
-    for _ in range(120):
-        play(one, int(rng.integers(one.action_space.n)))
+    rewards = [play(one, int(rng.integers(one.action_space.n)))[1] for _ in range(120)]
+    assert min(rewards) == -(game == "Pong")  # a lost point is -1
     torch.save(dqn.environment_state(one), tmp_path / "state")
     other.reset(seed=1)
     dqn.restore_environment(other, torch.load(tmp_path / "state", weights_only=True))
@@ -275,7 +271,7 @@ def test_contradictions_are_refused(stopped):
     "--environment-state-width 35", f"--device {'mps' if torch.cuda.is_available() else 'cuda'}"])
 def test_bad_input_is_refused_in_one_line(flags, tmp_path):
     name, value = flags.split()
-    code = run(**{name[2:]: value, "runs_dir": tmp_path / "runs"})
+    code = run(**{name[2:].replace("-", "_"): value, "runs_dir": tmp_path / "runs"})
     assert isinstance(code, str) and code.startswith("error: ") and "\n" not in code
     assert not (tmp_path / "runs").exists()
 

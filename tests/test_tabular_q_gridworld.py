@@ -154,12 +154,14 @@ class TestCommandLine:
         assert "max |Q - Q*| = 0.0000, optimal in 37 of 37" in done.stdout, done.stderr
 
     def test_without_a_model(self, tmp_path, monkeypatch):
-        gym.register("Loop-v0", lambda: Loop(3, terminated=True))
-        monkeypatch.setattr("sys.argv", ["", "--env-id", "Loop-v0", "--runs-dir", str(tmp_path)])
+        gym.register("Loop-v0", Loop)
+        flags = ["--env-id", "Loop-v0", "--episodes", "2", "--runs-dir", str(tmp_path)]
+        monkeypatch.setattr("sys.argv", ["", *flags])
         script.main()
         del gym.registry["Loop-v0"]
-        scalars = EventAccumulator(str(next(tmp_path.iterdir()))).Reload().Tags()["scalars"]
-        assert scalars == ["mean return"]
+        events = EventAccumulator(str(next(tmp_path.iterdir()))).Reload()
+        assert events.Tags()["scalars"] == ["mean return"]
+        assert events.Scalars("mean return")[-1].value == 1000  # the time limit: 1,000 steps
 
     def test_environment_arguments(self):
         env = script.make_world(Args(env_id="FrozenLake-v1", env_kwargs="is_slippery=false"))
