@@ -6,6 +6,7 @@ evaluations, the final test.
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,11 @@ class Args:
 
 def main(args: Args) -> None:
     """Read TensorBoard's events, evaluations.csv and test.json; draw learning_curve.png."""
+    if not (args.run_dir / "args.json").exists():
+        sys.exit(f"{args.run_dir}: no run directory, which holds an args.json")
     events = EventAccumulator(str(args.run_dir), size_guidance={"scalars": 0}).Reload()
+    if "charts/episodic_return" not in events.Tags()["scalars"]:
+        sys.exit(f"{args.run_dir}: no TensorBoard events of a finished training game")
     points = events.Scalars("charts/episodic_return")
     games = pd.Series([p.value for p in points], index=[p.step for p in points])
     run = json.loads((args.run_dir / "args.json").read_text())
