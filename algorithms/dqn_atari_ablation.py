@@ -80,7 +80,7 @@ class Args:
     environment_reward_clip_limit: float = 1.0
     """while training, rewards are clipped to [-limit, limit]"""
     environment_frames_to_maxpool: int = 2
-    """last emulator frames whose pixelwise maximum is the screen"""
+    """last emulator frames of an action, whose pixelwise maximum is the screen"""
     environment_state_height: int = 84
     """height of a frame, pixels, at least 36"""
     environment_state_width: int = 84
@@ -283,7 +283,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
     gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
     try:
-        env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
+        # Of a name with a colon, Gymnasium would import the part before it as a module.
+        env = gym.make(args.env_id.replace(":", " "), frameskip=1, repeat_action_probability=0.0,
                        full_action_space=False, max_num_frames_per_episode=108_000)
     except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
@@ -596,7 +597,8 @@ def write_test(path: Path, counters: Counters, finished: list) -> None:
         "lengths": [length for _, length in finished],
     }
     print("\n".join(f"{name:32}{value}" for name, value in result.items()))
-    write_file(path, lambda temporary: temporary.write_text(json.dumps(result, indent=2)))
+    # JSON has no NaN.
+    write_file(path, lambda p: p.write_text(json.dumps(result, indent=2).replace("NaN", "null")))
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -717,8 +719,8 @@ def main(args: Args) -> None:
 
     def save_q_network() -> None:
         """What it takes to play."""
-        if not loss.isfinite():  # a NaN never leaves the weights again
-            raise SystemExit(f"error: the loss is {loss}; lower --optimizer-learning-rate")
+        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # and so it would stay
+            raise SystemExit("error: a weight is NaN or infinite; lower --optimizer-learning-rate")
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
                    "q_network": q_network.state_dict()}
         write_file(run_dir / "q_network.pt", lambda path: torch.save(content, path))
@@ -826,5 +828,5 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    except (OSError, KeyboardInterrupt) as error:  # a full disk; Ctrl-C before or after the loop
+    except (OSError, MemoryError, KeyboardInterrupt) as error:  # Ctrl-C outside the loop
         raise SystemExit(f"error: {str(error) or 'interrupted'}") from None

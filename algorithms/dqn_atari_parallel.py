@@ -99,7 +99,7 @@ class Args:
     environment_reward_clip_limit: float = 1.0
     """while training, rewards are clipped to [-limit, limit]"""
     environment_frames_to_maxpool: int = 2
-    """last emulator frames whose pixelwise maximum is the screen"""
+    """last emulator frames of an action, whose pixelwise maximum is the screen"""
     environment_state_height: int = 84
     """height of a frame, pixels, at least 36"""
     environment_state_width: int = 84
@@ -296,7 +296,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
     gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
     try:
-        env = gym.make(args.env_id, frameskip=1, repeat_action_probability=0.0,
+        # Of a name with a colon, Gymnasium would import the part before it as a module.
+        env = gym.make(args.env_id.replace(":", " "), frameskip=1, repeat_action_probability=0.0,
                        full_action_space=False, max_num_frames_per_episode=108_000)
     except (gym.error.Error, ImportError, TypeError) as error:  # TypeError: another kind of game
         raise SystemExit(f"error: {args.env_id} is no Atari game: {error}") from None
@@ -568,13 +569,11 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         # Purged: TensorBoard's points after the checkpoint, whose numbers come once more.
         writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
         print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
-    loss = torch.zeros(())  # until the first update
 
     def save() -> None:
         """Of rank 0: q_network.pt, what it takes to play, and checkpoint.pt, to learn on."""
-        # A NaN, of another rank's gradient, too, reaches the head and never leaves it again.
-        if not (loss + q_network.head.bias.sum()).isfinite():
-            raise SystemExit("error: a weight or the loss is NaN; lower --optimizer-learning-rate")
+        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # and so it would stay
+            raise SystemExit("error: a weight is NaN or infinite; lower --optimizer-learning-rate")
         writer.flush()
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
                    "q_network": q_network.state_dict()}
@@ -605,8 +604,8 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         if replay.added * ranks >= args.agent_replay_buffer_initial:
             for _ in range(passed(counters.frames, step, args.agent_update_frequency)):
                 minibatch = replay.gather(minibatch_rng.integers(len(replay), size=batch_size))
-                loss, _ = update(shared_network, target_network, optimizer, minibatch,
-                                 args.agent_discount_factor, args.precision)
+                update(shared_network, target_network, optimizer, minibatch,
+                       args.agent_discount_factor, args.precision)
                 counters.updates += 1
 
         # 24-26  θ⁻ = θ
@@ -669,7 +668,8 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         finished = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
-        write_file(run_dir / "test.json", lambda path: path.write_text(json.dumps(test, indent=2)))
+        text = json.dumps(test, indent=2).replace("NaN", "null")  # JSON has no NaN
+        write_file(run_dir / "test.json", lambda path: path.write_text(text))
     if ranks > 1:
         # All wait for rank 0: of a stopped run each ends with a code above 0, and with the first
         # torchrun kills the rest.

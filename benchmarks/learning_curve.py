@@ -46,8 +46,8 @@ def main(args: Args) -> None:
                       fmt="o", markersize=4, color="tab:orange", capsize=3,
                       label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, "
                             "standard deviation")
-    if (args.run_dir / "test.json").exists():
-        test = json.loads((args.run_dir / "test.json").read_text())
+    test = args.run_dir / "test.json"
+    if test.exists() and (test := json.loads(test.read_text()))["scores"]:
         axes.axhline(test["score_mean"], color="tab:green", linestyle="--",
                      label=f"final test, {len(test['scores'])} games: {test['score_mean']:.2f}")
     axes.set(xlabel="frames (each four of the emulator's)", ylabel="score of a game",

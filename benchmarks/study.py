@@ -146,9 +146,10 @@ def identity(args: dict) -> tuple:
 
 
 def run_directories(folder: Path, pattern: str = "*") -> list[Path]:
-    """The run directories below a folder, oldest first: their names end in the time, but for
-    published ones, which come before all others."""
+    """The run directories below a folder but for `published` ones, oldest first: their names end in
+    the time."""
     found = [path.parent for path in folder.rglob(f"{pattern}/args.json")]
+    found = [path for path in found if "published" not in path.relative_to(folder).parts]
     return sorted(found, key=lambda run_dir: (run_dir.name.rpartition("__")[1:], run_dir))
 
 
@@ -322,7 +323,10 @@ def draw_curves(run_dirs: list[Path], file: str) -> None:
         axes[0].legend(lines.values(), lines.keys(), fontsize="small")
         axes[0].set_title(textwrap.fill(f"{game}: {label}", 75), fontsize="small")
         axes[1].set_yscale("symlog")  # what diverges goes through decades
-    figure.savefig(file, dpi=120)
+    try:
+        figure.savefig(file, dpi=120)
+    except (OSError, ValueError) as error:  # a ValueError: a format that matplotlib does not know
+        raise SystemExit(f"error: {file} could not be drawn: {error}") from None
 
 
 # ---- main --------------------------------------------------------------------------------------
@@ -348,9 +352,9 @@ def main() -> None:
         if flags:
             parser.error(f"unrecognized arguments: {' '.join(flags)}")
         run_dirs = run_directories(Path(options.dir))
+        print_tables(read_tests(run_dirs), options.markdown)
         if options.figure:
             draw_curves(run_dirs, options.figure)
-        print_tables(read_tests(run_dirs), options.markdown)
         return
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:

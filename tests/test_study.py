@@ -108,12 +108,12 @@ def test_ctrl_c_reaches_the_run_and_ends_the_study(study, tmp_path):
 
 def test_tables_hold_means_over_seeds_and_the_iqm_and_mix_nothing_unlike(study, tmp_path):
     scores = [1.0, 12.0, 4.0, 2.0, 6.0]
-    runs = [(500.0, {"seed": 1})]  # older than the other run of this seed: does not count
+    runs = [(500.0, {"seed": 1}), (500.0, {"seed": 6})]  # older; published
     runs += [(score, {"seed": seed, "threads": seed}) for seed, score in enumerate(scores, 1)]
     runs += [(3.5, {"replay_buffer": False}), (7.0, {"environment_train_frames_max": 9})]
     names = [*enumerate(("score_mean", "score_variance", "length_mean", "length_variance"))]
     for number, (score, args) in enumerate(runs):  # dqn_atari.py writes no fields of an arm
-        run_dir = tmp_path / "runs" / (f"run__{number}" if number else "published")
+        run_dir = tmp_path / "runs" / ("published" if number == 1 else f"run__{number}")
         run_dir.mkdir(parents=True)
         (run_dir / "args.json").write_text(json.dumps(args))
         (run_dir / "test.json").write_text(json.dumps({n: score * 10**i for i, n in names}))
