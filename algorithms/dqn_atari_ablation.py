@@ -719,7 +719,7 @@ def main(args: Args) -> None:
 
     def save_q_network() -> None:
         """What it takes to play."""
-        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # and so it would stay
+        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # a NaN stays
             raise SystemExit("error: a weight is NaN or infinite; lower --optimizer-learning-rate")
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,
                    "q_network": q_network.state_dict()}
@@ -828,5 +828,5 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    except (OSError, MemoryError, KeyboardInterrupt) as error:  # Ctrl-C outside the loop
+    except (OSError, MemoryError, KeyboardInterrupt) as error:  # of Ctrl-C outside the loop
         raise SystemExit(f"error: {str(error) or 'interrupted'}") from None

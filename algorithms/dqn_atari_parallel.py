@@ -572,7 +572,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
 
     def save() -> None:
         """Of rank 0: q_network.pt, what it takes to play, and checkpoint.pt, to learn on."""
-        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # and so it would stay
+        if not all(θ.isfinite().all() for θ in q_network.parameters()):  # a NaN stays
             raise SystemExit("error: a weight is NaN or infinite; lower --optimizer-learning-rate")
         writer.flush()
         content = {"args": vars(args), "actions": actions, "frames": counters.frames,

@@ -26,10 +26,10 @@ class Args:
 def main(args: Args) -> None:
     """Read TensorBoard's events, evaluations.csv and test.json; draw learning_curve.png."""
     if not (args.run_dir / "args.json").exists():
-        sys.exit(f"{args.run_dir}: no run directory, which holds an args.json")
+        sys.exit(f"error: {args.run_dir} is no run directory: args.json is missing")
     events = EventAccumulator(str(args.run_dir), size_guidance={"scalars": 0}).Reload()
     if "charts/episodic_return" not in events.Tags()["scalars"]:
-        sys.exit(f"{args.run_dir}: no TensorBoard events of a finished training game")
+        sys.exit(f"error: {args.run_dir} has no TensorBoard events of a finished game")
     points = events.Scalars("charts/episodic_return")
     games = pd.Series([p.value for p in points], index=[p.step for p in points])
     run = json.loads((args.run_dir / "args.json").read_text())
@@ -46,10 +46,11 @@ def main(args: Args) -> None:
                       fmt="o", markersize=4, color="tab:orange", capsize=3,
                       label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, "
                             "standard deviation")
-    test = args.run_dir / "test.json"
-    if test.exists() and (test := json.loads(test.read_text()))["scores"]:
-        axes.axhline(test["score_mean"], color="tab:green", linestyle="--",
-                     label=f"final test, {len(test['scores'])} games: {test['score_mean']:.2f}")
+    if (args.run_dir / "test.json").exists():
+        test = json.loads((args.run_dir / "test.json").read_text())
+        if test["scores"]:  # else no game of the test ended
+            axes.axhline(test["score_mean"], color="tab:green", linestyle="--",
+                         label=f"final test, {len(test['scores'])} games: {test['score_mean']:.2f}")
     axes.set(xlabel="frames (each four of the emulator's)", ylabel="score of a game",
              title=f"{run['env_id']}, seed {run['seed']}")
     axes.grid(alpha=0.3)

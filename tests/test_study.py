@@ -108,7 +108,7 @@ def test_ctrl_c_reaches_the_run_and_ends_the_study(study, tmp_path):
 
 def test_tables_hold_means_over_seeds_and_the_iqm_and_mix_nothing_unlike(study, tmp_path):
     scores = [1.0, 12.0, 4.0, 2.0, 6.0]
-    runs = [(500.0, {"seed": 1}), (500.0, {"seed": 6})]  # older; published
+    runs = [(500.0, {"seed": 1}), (500.0, {"seed": 6})]  # older than seed 1's below; published
     runs += [(score, {"seed": seed, "threads": seed}) for seed, score in enumerate(scores, 1)]
     runs += [(3.5, {"replay_buffer": False}), (7.0, {"environment_train_frames_max": 9})]
     names = [*enumerate(("score_mean", "score_variance", "length_mean", "length_variance"))]
