@@ -7,9 +7,9 @@
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
-epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a run, checksums,
-RMSProp, --threads, the choice of the precision, all curves but those of games, and of test.json
-all but the figures of Tables 4 to 6 and the scores. [8] is Mnih et al., Nature 518 (2015).
+ReplayShare, epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a
+run, checksums, RMSProp, --threads, the choice of the precision, all curves but those of games, the
+speeds, lengths and last evaluations of test.json. [8] is Mnih et al., Nature 518 (2015).
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
                                                           each

@@ -1,7 +1,7 @@
 """A run's learning curve as a picture: every training game, the mean of the last 20, the
 evaluations, the final test.
 
-    python benchmarks/learning_curve.py runs/published/pong      # writes learning_curve.png into it
+    python benchmarks/learning_curve.py runs/published/breakout  # writes learning_curve.png into it
 """
 
 import dataclasses
