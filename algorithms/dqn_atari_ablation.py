@@ -294,7 +294,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84), the space of the result
-    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling. (None: the space
+    # of observations is put right by the second.)
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -309,8 +310,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 class ReplayMemory:
     """𝒟: the last `capacity` transitions (§5.3). Each has references to its own 5 frames (s' is s
-    moved on by one), an action, a clipped reward, and whether s' is terminal. Arrays are made when
-    a minibatch is drawn (§7.3.2). `shape` is that of a state, (4, 84, 84)."""
+    moved on by one), an action, a clipped reward, and whether s' is terminal. A row's neighbours
+    can be of other games. Arrays are made when a minibatch is drawn (§7.3.2). `shape` is that of a
+    state, (4, 84, 84)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
@@ -331,6 +333,7 @@ class ReplayMemory:
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
         """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
         s' like s, terminal (B,) bool, on the device."""
+        # The frames that s and s' share are decompressed twice: once is no quicker.
         s = self.decode(self.frames[indices, :-1])  # (B, 4, 84, 84)
         s_next = self.decode(self.frames[indices, 1:])  # (B, 4, 84, 84)
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
@@ -390,7 +393,8 @@ class QNetwork(nn.Module):
         self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        # float() makes a new array of the uint8, which is divided in place: no third one.
+        # Of uint8, float() makes a new array, which is divided in place: no third one. (A float32
+        # input would itself be changed.)
         x = self.layers(states.float().div_(255))  # (B, 512)
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -476,7 +480,7 @@ class NatureRMSprop(torch.optim.Optimizer):
 
 
 def make_optimizer(args: Args, q_network: QNetwork) -> torch.optim.Optimizer:
-    """Table 3's Adam, or Figure 18's RMSProp."""
+    """Table 3's Adam (fused: one call for all weights), or Figure 18's RMSProp."""
     if args.optimizer_name == "Adam":
         return torch.optim.Adam(q_network.parameters(), lr=args.optimizer_learning_rate, fused=True)
     return NatureRMSprop(q_network.parameters(), lr=args.optimizer_learning_rate)
@@ -489,7 +493,7 @@ def choose_precision(args: Args, q_network: QNetwork, shape: tuple[int, int, int
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
     s = s.to(memory_format=torch.channels_last)  # as gather gives it
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,); r and terminal like it
-    inputs = (q_network, q_network, optimizer, (s, a, a.float(), s, a.bool()), 0.99)
+    inputs = (q_network, copy.deepcopy(q_network), optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
     def seconds(precision: str) -> float:
         return timeit.timeit(lambda: update(*inputs, precision)[0].item(), number=1)
@@ -541,7 +545,8 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     the final test, does not. Seed and number alone decide all that is random. Returns (score,
     length in frames) of every game that has ended."""
     games = args.environment_evaluation_episodes if number else math.inf
-    # main's generators are made from [seed, 0], the test's from [seed, 1], these from what follows.
+    # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
+    # [seed, number + 1].
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -614,8 +619,8 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def environment_state(env: gym.Env) -> dict:
-    """What the emulator and the wrappers remember: FrameHistory, LifeLoss (its frame, info and
-    game_over come from the next step: no reset is due now) and RecordEpisodeStatistics."""
+    """What the emulator, FrameHistory, LifeLoss and RecordEpisodeStatistics remember. The rest of
+    LifeLoss is not saved: the next step sets it before it is read."""
     emulator = env.unwrapped.ale.cloneState(include_rng=True).serialize()
     names = ("history", "lives", "episode_returns", "episode_lengths")
     return {"emulator": emulator} | {name: env.get_wrapper_attr(name) for name in names}
@@ -668,8 +673,8 @@ def open_run(args: Args, script: str) -> tuple[Path, filelock.FileLock]:
 def main(args: Args) -> None:
     """Algorithm 6 (its line numbers head the comments), and what it needs and leaves behind."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and numbers
-    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0, in PyTorch's
-    # threads, too, which are started later.
+    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0; on Linux in
+    # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
     torch.set_num_threads(args.threads or torch.get_num_threads())
     args.threads = torch.get_num_threads()  # into args.json: a resumed run has as many
@@ -697,7 +702,7 @@ def main(args: Args) -> None:
     if not args.target_network:
         target_network = q_network
     held_out = held_out_states(args, replay.decode)  # (500, 4, 84, 84)
-    # 5-7  ε is a function of the frame; the rest is counted.
+    # 5-7  ε is computed from the frame, in the loop; the rest is counted.
     counters = Counters()
     s, _ = env.reset(seed=args.seed)
 
@@ -715,7 +720,7 @@ def main(args: Args) -> None:
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Frames are slower once learning starts, at {args.agent_replay_buffer_initial:,}.")
-    loss = q = torch.zeros(())  # until the first update
+    loss = q = torch.tensor(math.nan)  # until the first update
 
     def save_q_network() -> None:
         """What it takes to play."""
@@ -735,13 +740,13 @@ def main(args: Args) -> None:
         content["counters"] = vars(counters)
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    stop = []  # signals so far: with one, the loop ends after the frame, or the evaluation
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: stop.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
     started = time.monotonic() - counters.seconds
     checkpoint_time = window_time = time.monotonic()
     window_frames = counters.frames
+    stop = []  # signals so far: with one, the loop ends after the frame, or the evaluation
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
 
     # 8, 30  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max and not stop:
@@ -756,7 +761,8 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        if "episode" in info:  # a game is over: RecordEpisodeStatistics, inside LifeLoss
+        # A game is over: RecordEpisodeStatistics is inside LifeLoss. The names are CleanRL's.
+        if "episode" in info:
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)
             bar.set_postfix_str(f"score {info['episode']['r']:g}, ε {epsilon:.2f}", refresh=False)
@@ -797,6 +803,7 @@ def main(args: Args) -> None:
         bar.update()
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
+            # Evaluations and files included.
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
             # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
@@ -829,4 +836,4 @@ if __name__ == "__main__":
     try:
         main(read_args())
     except (OSError, MemoryError, KeyboardInterrupt) as error:  # of Ctrl-C outside the loop
-        raise SystemExit(f"error: {str(error) or 'interrupted'}") from None
+        raise SystemExit(f"error: {str(error) or type(error).__name__}") from None

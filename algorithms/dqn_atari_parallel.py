@@ -7,9 +7,10 @@
 # ///
 r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544NA, Lecture 27,
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
-ReplayShare, epsilon_greedy_batch, passed, learn and main. It drops exact resume, the lock on a
-run, checksums, RMSProp, --threads, the choice of the precision, all curves but those of games, the
-speeds, lengths and last evaluations of test.json. [8] is Mnih et al., Nature 518 (2015).
+ReplayShare, epsilon_greedy_batch, passed, learn and main; the rest is dqn_atari.py's, word for
+word. It drops exact resume, the lock on a run, checksums, RMSProp, --threads, the choice of the
+precision, all curves but those of games, the speeds, lengths and last evaluations of test.json.
+[8] is Mnih et al., Nature 518 (2015).
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
                                                           each
@@ -22,7 +23,7 @@ speeds, lengths and last evaluations of test.json. [8] is Mnih et al., Nature 51
 Run it
     python algorithms/dqn_atari_parallel.py --num-simulators 8 --agent-update-frequency 4
     python algorithms/dqn_atari_parallel.py --resume runs/RUN
-    torchrun --nproc-per-node 2 algorithms/dqn_atari_parallel.py    # 2 processes; 2 GPUs
+    torchrun --nproc-per-node 2 algorithms/dqn_atari_parallel.py    # 2 processes; not on Windows
     torchrun --nnodes 2 --nproc-per-node 2 --rdzv-backend c10d --rdzv-id 1 \
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
@@ -307,7 +308,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     env = ActionRepeat(env, args.agent_action_repeat, args.environment_frames_to_maxpool)
     size = (args.environment_state_width, args.environment_state_height)
     pixels = gym.spaces.Box(0, 255, size[::-1], np.uint8)  # (84, 84), the space of the result
-    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling. (None: the space
+    # of observations is put right by the second.)
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
@@ -355,6 +357,7 @@ class ReplayShare:
     def gather(self, indices: np.ndarray) -> tuple[torch.Tensor, ...]:
         """The transitions at `indices` (B,): s (B, 4, 84, 84) uint8, a (B,) int64, r (B,) float32,
         s' like s, terminal (B,) bool, on the device."""
+        # The frames that s and s' share are decompressed twice: once is no quicker.
         s = self.decode(self.frames[indices, :-1])  # (B, 4, 84, 84)
         s_next = self.decode(self.frames[indices, 1:])  # (B, 4, 84, 84)
         a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
@@ -390,7 +393,8 @@ class QNetwork(nn.Module):
         self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        # float() makes a new array of the uint8, which is divided in place: no third one.
+        # Of uint8, float() makes a new array, which is divided in place: no third one. (A float32
+        # input would itself be changed.)
         x = self.layers(states.float().div_(255))  # (B, 512)
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -470,7 +474,8 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     the final test, does not. Seed and number alone decide all that is random. Returns (score,
     length in frames) of every game that has ended."""
     games = args.environment_evaluation_episodes if number else math.inf
-    # main's generators are made from [seed, 0], the test's from [seed, 1], these from what follows.
+    # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
+    # [seed, number + 1].
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
@@ -519,8 +524,8 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: int) -> None:
     """Algorithm 6 in one of `ranks` processes. Rank 0 evaluates, logs and writes."""
     # For speed alone: where a unit gets no gradient any more, Adam's moments fade, and numbers
-    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0, in PyTorch's
-    # threads, too, which are started later.
+    # below 1e-38 (denormal) make many CPUs slow. From here on such numbers count as 0; on Linux in
+    # PyTorch's threads, too, which are started later.
     torch.set_flush_denormal(True)
     # For speed alone, on Linux: once a block of 30 MB (at most 32) has been freed, the C library
     # keeps up to 60 MB that are free. Else it gives an update's memory back to the system, and the
@@ -543,7 +548,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     optimizer = torch.optim.Adam(q_network.parameters(), args.optimizer_learning_rate, fused=True)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
-    # 5-7  ε is a function of the frame; the rest is counted.
+    # 5-7  ε is computed from the frame, in the loop; the rest is counted.
     counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[])
 
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
@@ -582,14 +587,14 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         content["counters"] = vars(counters)
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
-    signals = []  # to this rank: with one to any, the loop ends after the step, or the evaluation
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, disable=rank > 0)
     started = time.monotonic() - counters.seconds
     save_time, stopping = time.monotonic(), 0
     step = args.num_simulators * ranks  # frames: one of each simulator of each rank
     batch_size = args.optimizer_minibatch_size // ranks
+    signals = []  # to this rank: with one to any, the loop ends after the step, or the evaluation
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: signals.append(number))
 
     # 8, 30  while total_frames < number of frames to train
     while counters.frames < args.environment_train_frames_max and not stopping:
@@ -695,6 +700,7 @@ def main(args: Args) -> None:
     makers = [functools.partial(make_simulator, args, rng, os.getpid()) for rng in rngs[2:]]
     # Not "fork": the copy of a process whose threads hold locks can hang. A server forks instead.
     # Each simulator imports this file; the server has imported its slow modules once for all.
+    # (Without a server, by "spawn", each imports them for itself, into 0.3 GB of memory.)
     multiprocessing.set_forkserver_preload(["gymnasium", "pandas", "torch.utils.tensorboard"])
     envs = AsyncVectorEnv(makers, context="forkserver" if sys.platform == "linux" else "spawn",
                           autoreset_mode=AutoresetMode.SAME_STEP)
@@ -716,5 +722,6 @@ if __name__ == "__main__":
     try:
         main(read_args())
     # A full disk; a simulator that dies as it starts; Ctrl-C before or after the loop.
-    except (OSError, EOFError, KeyboardInterrupt) as error:
-        raise SystemExit(f"error: {str(error) or 'interrupted, or a simulator has died'}") from None
+    except (OSError, EOFError, MemoryError, KeyboardInterrupt) as error:
+        text = str(error) or f"{type(error).__name__}: interrupted, or a simulator has died"
+        raise SystemExit(f"error: {text}") from None

@@ -16,7 +16,7 @@ Run it
 
 In the folder play-seed1 beside q_network.pt, or in --output; an earlier game there gives way:
     episode.webm   the game, 15 frames a second, with Q of every action and the value beside it
-    play.gif       its first twelve seconds; 0.2 to 1.1 MB, by game
+    play.gif       its first twelve seconds; 0.4 to 0.7 MB, by game
     values.png     Figure 20: value, Q of every action and best action against the frame
     moments.png    Figures 21, 22, 24, …: three frames around each of three jumps of the value
     trace.csv      frame, value, Q of every action, action, greedy or random, reward, lives
@@ -186,7 +186,8 @@ def make_evaluation_env(trained, no_op_rng: np.random.Generator) -> gym.Env:
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, trained.agent_action_repeat, trained.environment_frames_to_maxpool)
     env = KeepScreen(env)
-    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling. (None: the space
+    # of observations is put right by the second.)
     size = (trained.environment_state_width, trained.environment_state_height)
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), None)
@@ -212,7 +213,8 @@ class QNetwork(nn.Module):
         self.head = nn.Linear(512, num_actions)  # (B, num_actions)
 
     def forward(self, states: torch.Tensor) -> torch.Tensor:
-        # float() makes a new array of the uint8, which is divided in place: no third one.
+        # Of uint8, float() makes a new array, which is divided in place: no third one. (A float32
+        # input would itself be changed.)
         x = self.layers(states.float().div_(255))  # (B, 512)
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
@@ -309,7 +311,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # by its action
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # after its action
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")
