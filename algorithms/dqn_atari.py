@@ -40,8 +40,8 @@ Deviations
     [8]'s code: an episode's first        copies of its first frame           an empty frame is
     states have empty frames                                                  no screen of the game
     [8]'s code: screens averaged by area  bilinear, without antialiasing      §7.2.1 says bilinear
-    [8]'s code: no-operations after each  none; the agent goes on             nothing was reset
-    lost life, too
+    Algorithm 6: reset after a lost life  the game goes on, without the       later lives are
+    (§7.2.1)                              no-operations of [8]'s code         played, too
     [8]'s code: θ⁻ every 10,000 frames    40,000 in the command above         Figure 18: updates
     raw frames, shared by reference       LZ4 frames, shared by reference     0.4 to 1.4 GB, not 11
 """
@@ -192,8 +192,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
-    `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
+    DOWN (§7.3.3). Their names: `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -389,7 +389,8 @@ class ReplayMemory:
 
 
 class QNetwork(nn.Module):
-    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32."""
+    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32, in one pass for
+    all actions (Figure 13)."""
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()
@@ -498,7 +499,7 @@ def choose_precision(args: Args, q_network: QNetwork, shape: tuple[int, int, int
     `q_network`, a copy; `shape` is that of a state."""
     optimizer = make_optimizer(args, q_network)
     s = torch.zeros((args.optimizer_minibatch_size, *shape), dtype=torch.uint8, device=args.device)
-    s = s.to(memory_format=torch.channels_last)  # as gather gives it
+    s = s.to(memory_format=torch.channels_last)  # (B, 4, 84, 84), as gather gives it
     a = torch.zeros(len(s), dtype=torch.int64, device=args.device)  # (B,); r and terminal like it
     inputs = (q_network, copy.deepcopy(q_network), optimizer, (s, a, a.float(), s, a.bool()), 0.99)
 
@@ -700,7 +701,7 @@ def main(args: Args) -> None:
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Frames are slower once learning starts, at {args.agent_replay_buffer_initial:,}.")
-    loss = q = torch.tensor(math.nan)  # until the first update
+    loss = q = torch.tensor(math.nan)  # () until the first update
 
     def save_q_network() -> None:
         """What it takes to play."""

@@ -12,10 +12,8 @@ word. It drops exact resume, the lock on a run, checksums, RMSProp, --threads, t
 precision, all curves but those of games, the speeds, lengths and last evaluations of test.json.
 [8] is Mnih et al., Nature 518 (2015).
 
-    simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step is a frame of
-                                                          each
-    learner       act|  updates   act|  updates   act|    N actions from one batch; it learns while
-                                                          the simulators step
+    simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step: a frame each
+    learner       act|  updates   act|  updates   act|    N actions, one batch; it learns meanwhile
     torchrun starts more learners, its ranks, with N simulators and a part of 𝒟 each. θ is the same
     in all: the gradient of an update is the mean of theirs. Rank 0, the only one without torchrun,
     evaluates, logs and writes; the others wait. Table 3's counts are totals over the ranks.
@@ -34,6 +32,7 @@ Measured, on two cores of an AMD EPYC, bfloat16, one update in four
 Deviations, beside those of dqn_atari.py
     Algorithm 6                           this file                           why
     ------------------------------------  ----------------------------------  --------------------
+    §7.3.2: asynchronously [6]            in step; learning overlaps          one θ, never stale
     an update follows its frame           updates sample 𝒟 without the        emulation and learn-
                                           frames that are under way           ing at the same time
     frames are counted one by one         N × ranks at a time; θ is copied    simulators step
@@ -195,8 +194,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
-    `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
+    DOWN (§7.3.3). Their names: `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -378,7 +377,8 @@ class ReplayShare:
 
 
 class QNetwork(nn.Module):
-    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32."""
+    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32, in one pass for
+    all actions (Figure 13)."""
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()

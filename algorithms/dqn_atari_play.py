@@ -96,8 +96,8 @@ class Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """The game's minimal actions within NOOP, FIRE, UP, RIGHT, LEFT, DOWN (§7.3.3). Their names:
-    `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
+    DOWN (§7.3.3). Their names: `meanings`."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -198,7 +198,8 @@ def make_evaluation_env(trained, no_op_rng: np.random.Generator) -> gym.Env:
 
 
 class QNetwork(nn.Module):
-    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32."""
+    """Table 2: states (B, 4, 84, 84) uint8 to Q(s, ·; θ) (B, num_actions) float32, in one pass for
+    all actions (Figure 13)."""
 
     def __init__(self, history_length: int, height: int, width: int, num_actions: int):
         super().__init__()

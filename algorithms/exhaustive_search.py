@@ -15,7 +15,8 @@ Measured
     The first command evaluates 3 policies and finds π1 with V(s0) = 11.
 
 Deviations
-    A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2.
+    A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2, which
+    bounds them by Π_s |A_s|, here 2 · 1 · 2 = 4.
     Every evaluation starts from the values of the policies before it, as §4.2 suggests. Each policy
     is also evaluated from V = 0, to show how many sweeps that saves.
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
@@ -261,8 +262,11 @@ def main(args: Args) -> None:
     model, env, P, R = read_model(args)
     start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) or 1, 0, …
     policy, V, tried = exhaustive_search(P, R, start, args)
-    for i, (value, sweeps, sweeps_from_0) in enumerate(tried[:10], start=1):
-        print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0")
+    for i, (π, counts) in enumerate(zip(policies(P, R, start), tried[:10], strict=False), start=1):
+        actions = [f"{s}={list(model[s])[a]}" for s, a in zip(model, π, strict=True) if a >= 0]
+        value, sweeps, sweeps_from_0 = counts
+        print(f"π{i}: V of the start {value:.12g}, {sweeps} sweeps, {sweeps_from_0} from V = 0; "
+              f"{' '.join(actions)}")
     _, sweeps, sweeps_from_0 = np.sum(tried, axis=0)
     print(f"{len(tried)} policies, {sweeps:.0f} sweeps, {sweeps_from_0:.0f} from V = 0\n")
     Q = backup(P, R, V, args.discount)  # (A, S)

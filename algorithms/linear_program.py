@@ -4,7 +4,7 @@
 #     "gymnasium>=1.3", "numpy>=2.0", "pandas>=2.2", "scipy>=1.14", "tyro>=0.9",
 # ]
 # ///
-"""The Bellman optimality equation as a linear program (§4.3, Equation 27).
+"""The Bellman optimality equation as a linear program (§4.3, Equation 27), for few states.
 
 Run it
     python algorithms/linear_program.py                       # the lecture's MDP, its program

@@ -67,7 +67,7 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1] (Equation 34 is undiscounted: 1)"""
     learning_rate: float = 0.7
-    """α of the first visit of (s, a), in [0, 1] (Equation 34)"""
+    """α of the first visit of (s, a), in [0, 1] (Equation 34: not 0)"""
     learning_rate_exponent: float = 0.85
     """ω in [0, 1] of α = learning_rate · N(s,a)^-ω, N(s,a) visits; 0: a constant α"""
     epsilon_initial: float = 1.0

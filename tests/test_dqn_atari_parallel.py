@@ -95,15 +95,16 @@ def read_checkpoint(run_dir: Path) -> dict:
 def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     run = Run(tmp_path, num_simulators=simulators, environment_train_frames_max=400 * simulators,
               agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400,
-              environment_evaluation_interval_episodes=5)
+              environment_evaluation_interval_episodes=5, seed=simulators)
     decode = serial.ReplayMemory(1, (4, 44, 52), "cpu").decode
     s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
-    assert len({str(rng.bit_generator.state) for rng in run.no_op_rngs}) == simulators
+    fresh = np.random.default_rng([simulators, 0, 0]).spawn(2 + simulators)[2:]
+    assert [r.bit_generator.state for r in run.no_op_rngs] == [r.bit_generator.state for r in fresh]
     assert torch.equal(torch.cat([states for _, states, _ in run.acted]), s)
     ends, games = [], []
     for i, rng in enumerate(run.no_op_rngs):
         env = serial.FrameHistory(capped(serial.make_env(serial.Args(**SHORT), rng, True)), 4)
-        state, _ = env.reset(seed=1 + i)
+        state, _ = env.reset(seed=simulators + i)
         for j in range(i, len(s), simulators):
             assert torch.equal(s[j], decode([state])[0]), (i, j)
             state, reward, terminated, truncated, info = env.step(int(a[j]))
@@ -124,6 +125,7 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
 
 
 def test_batch_of_actions_is_greedy_for_each_state():
+    torch.manual_seed(0)
     q_network = parallel.QNetwork(4, 84, 84, 6)
     states = torch.randint(256, (5, 4, 84, 84), dtype=torch.uint8)
     q_network.head.weight.data *= 100

@@ -121,9 +121,6 @@ def refused(run_dir: Path, *flags) -> None:
     assert {path.name: path.read_bytes() for path in run_dir.iterdir()} == before
 
 
-# ---- exact ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("frame, number", [(100, signal.SIGTERM), (271, signal.SIGINT),
                                            ("life lost", signal.SIGTERM), (FRAMES, signal.SIGINT)])
 def test_stopped_and_resumed_is_never_stopped(straight, tmp_path, frame, number):
@@ -208,9 +205,6 @@ def test_the_emulator_goes_on_where_it_was(game, tmp_path):
         assert play(one, action) == play(other, action)
 
 
-# ---- refused -------------------------------------------------------------------------------------
-
-
 def test_two_processes_cannot_write_one_run(straight, tmp_path):
     seen = []
 
@@ -274,9 +268,6 @@ def test_bad_input_is_refused_in_one_line(flags, tmp_path):
     code = run(**{name[2:].replace("-", "_"): value, "runs_dir": tmp_path / "runs"})
     assert isinstance(code, str) and code.startswith("error: ") and "\n" not in code
     assert not (tmp_path / "runs").exists()
-
-
-# ---- failures ------------------------------------------------------------------------------------
 
 
 def test_a_full_disk_ends_the_run_in_one_line_and_it_can_be_resumed(straight, tmp_path):
