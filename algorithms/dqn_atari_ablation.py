@@ -24,7 +24,7 @@ Run it
     python benchmarks/study.py tables                               # Tables 4 to 6 so far
 
 Measured, Breakout, 500,000 frames, other flags as dqn_atari.py's run, mean score of the final test
-    with both switches 33.55, no target network 17.30, no replay buffer 2.029, neither 6.789
+    no switch 33.55, --no-target-network 17.30, --no-replay-buffer 2.029, both 6.789
 
 Deviations
     The lecture does not say what "no replay buffer" trains on. Here it is the most recent

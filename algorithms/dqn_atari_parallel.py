@@ -43,8 +43,8 @@ Deviations, beside those of dqn_atari.py
 
 A resumed run has its networks, optimizer and counts again, but an empty replay memory: it first
 acts until that holds the initial number (these frames count), then learns on; its random numbers
-start anew. All machines must see runs/RUN. 30 s after Ctrl-C torchrun kills what still
-runs: an evaluation that takes longer ends without a new checkpoint.
+start anew. GPUs and several machines, which must all see runs/RUN, are untested. 30 s after Ctrl-C
+torchrun kills what still runs: an evaluation that takes longer ends without a new checkpoint.
 """
 
 import copy
