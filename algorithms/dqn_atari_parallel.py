@@ -723,5 +723,5 @@ if __name__ == "__main__":
         main(read_args())
     # A full disk; a simulator that dies as it starts; Ctrl-C before or after the loop.
     except (OSError, EOFError, MemoryError, KeyboardInterrupt) as error:
-        text = str(error) or f"{type(error).__name__}: interrupted, or a simulator has died"
+        text = str(error) or "interrupted, out of memory, or a simulator has died"
         raise SystemExit(f"error: {text}") from None

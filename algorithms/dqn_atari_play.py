@@ -186,8 +186,7 @@ def make_evaluation_env(trained, no_op_rng: np.random.Generator) -> gym.Env:
     env = NoOpReset(env, no_ops, no_op_rng)
     env = ActionRepeat(env, trained.agent_action_repeat, trained.environment_frames_to_maxpool)
     env = KeepScreen(env)
-    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling. (None: the space
-    # of observations is put right by the second.)
+    # Colour to luminance, 0.299 R + 0.587 G + 0.114 B; then bilinear downsampling.
     size = (trained.environment_state_width, trained.environment_state_height)
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), None)

@@ -142,6 +142,8 @@ def test_a_run_leaves_every_file_and_flushes_denormals(tmp_path):
     assert same(weights(run_dir), torch.load(run_dir / "checkpoint.pt")["q_network"])
     events = EventAccumulator(str(run_dir)).Reload()
     assert {"charts/episodic_return", "charts/SPS"} <= set(events.Tags()["scalars"])
+    losses = [event.value for event in events.Scalars("losses/td_loss")]
+    assert math.isnan(losses[0]) and losses[1] > 0  # at 450 and 900; the first update is at 880
     games = [event.value for event in events.Scalars("charts/episodic_length")]
     assert 1 <= len(games) <= 7 and sum(games) <= 900  # games, of about 180 frames, not lives
 

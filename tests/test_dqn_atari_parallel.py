@@ -99,7 +99,7 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     decode = serial.ReplayMemory(1, (4, 44, 52), "cpu").decode
     s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
     fresh = np.random.default_rng([simulators, 0, 0]).spawn(2 + simulators)[2:]
-    assert [r.bit_generator.state for r in run.no_op_rngs] == [r.bit_generator.state for r in fresh]
+    assert [x.bit_generator.state for x in run.no_op_rngs] == [x.bit_generator.state for x in fresh]
     assert torch.equal(torch.cat([states for _, states, _ in run.acted]), s)
     ends, games = [], []
     for i, rng in enumerate(run.no_op_rngs):

@@ -17,7 +17,9 @@ def test_the_lectures_three_policies(tmp_path, capsys):
     assert result["policy"] == {"s0": "a1", "s1": "a1"}
     values, sweeps, from_0 = np.transpose(search(script.FIGURE_5, 1, 0, 0)[2])
     assert values == pytest.approx([11, 9, 111 / 11]) and sum(sweeps) < sum(from_0)
-    assert f" {sum(sweeps):g} sweeps, {sum(from_0):g} from V = 0\n" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f" {sum(sweeps):g} sweeps, {sum(from_0):g} from V = 0\n" in out
+    assert all(f"; s0={π}\n" in out for π in ("a1 s1=a1", "a2 s1=a1 s2=a1", "a2 s1=a1 s2=a2"))
 
 
 def test_the_warm_start():
