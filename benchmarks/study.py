@@ -20,11 +20,9 @@ runs have ended:
 
 A row of a table is the mean over seeds, the lecture's figure in brackets. Of two runs with the same
 flags and seed the newer counts. Runs of dqn_atari.py count, too. From three seeds up a row has the
-interquartile mean of the score with its 95 % bootstrap interval. Where all five games have three
-seeds, one more line puts them on one scale, 0 for random play and 1 for a person, and draws the
-seeds anew within each game (stratified bootstrap; Agarwal et al., NeurIPS 2021). Of three or four
-seeds such an interval is little more than their range. Runs with other hyperparameters or frames
-stand apart, under the flags in which they differ from Table 3.
+interquartile mean of the score with its 95 % bootstrap interval (Agarwal et al., NeurIPS 2021); of
+three or four seeds such an interval is little more than their range. Runs with other
+hyperparameters or frames stand apart, under the flags in which they differ from Table 3.
 """
 
 import argparse
@@ -85,14 +83,6 @@ NAMES = {
     True: "Yes", False: "No", "Riverraid": "River Raid", "SpaceInvaders": "Space Invaders",
     "default": "PyTorch Default", "he": "He", "orthogonal": "Orthogonal",
 }  # fmt: skip
-# scores of random play and of a person (DQN Zoo)
-RANDOM_AND_HUMAN = {
-    "Breakout": (1.7, 30.5),
-    "Enduro": (0.0, 860.5),
-    "Pong": (-20.7, 14.6),
-    "Riverraid": (1338.5, 17118.0),
-    "SpaceInvaders": (148.0, 1668.7),
-}
 STUDIES = {  # each arm's flags
     "ablation": [
         ["--target-network", "--replay-buffer"],
@@ -101,7 +91,9 @@ STUDIES = {  # each arm's flags
         ["--no-target-network", "--no-replay-buffer"],
     ],
     "initialization": [["--initialization", name] for name in ("default", "he", "orthogonal")],
-    "games": [["--env-id", f"{game}NoFrameskip-v4"] for game in RANDOM_AND_HUMAN],
+    "games": [
+        ["--env-id", f"{game}NoFrameskip-v4"] for game in sorted({arm.game for arm in LECTURE})
+    ],
 }
 TABLE_3 = "Table 3's hyperparameters"
 # flags that tell arms and seeds apart, or say only how a run is carried out
@@ -225,27 +217,18 @@ def read_tests(run_dirs: list[Path]) -> pd.DataFrame:
     return tests.drop_duplicates(["label", "arm", "seed"], keep="last")
 
 
-def interquartile_mean(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
     """Mean of the middle half of all scores; a quarter, rounded down, is cut off at each end."""
-    return stats.trim_mean(np.concatenate(strata, axis=axis), 0.25, axis=axis)
+    return stats.trim_mean(scores, 0.25, axis=axis)
 
 
-def iqm_with_interval(strata: list[np.ndarray]) -> str:
-    """The interquartile mean and its 95 % interval: seeds are drawn anew within each stratum."""
-    if min(map(len, strata)) < 3:
+def iqm_with_interval(scores: np.ndarray) -> str:
+    """The interquartile mean over seeds and its 95 % interval, from seeds drawn anew."""
+    if len(scores) < 3:
         return "-"
-    drawn = stats.bootstrap(strata, interquartile_mean, method="percentile", rng=0)
+    drawn = stats.bootstrap([scores], interquartile_mean, method="percentile", rng=0)
     low, high = drawn.confidence_interval
-    return f"{digits(interquartile_mean(*strata))} [{digits(low)}, {digits(high)}]"
-
-
-def human_normalised(tests: pd.DataFrame) -> str:
-    """The IQM over all five games of the score on a scale from random play, 0, to a person, 1."""
-    strata = []
-    for game, (random, human) in RANDOM_AND_HUMAN.items():
-        scores = tests.loc[tests["arm"] == Arm(game), "score_mean"].to_numpy()
-        strata.append((scores - random) / (human - random))
-    return iqm_with_interval(strata)
+    return f"{digits(interquartile_mean(scores))} [{digits(low)}, {digits(high)}]"
 
 
 def digits(value: float) -> str:
@@ -263,7 +246,7 @@ def make_table(tests: pd.DataFrame, arms: list[Arm], parts: list[str]) -> pd.Dat
         for i, name in enumerate(FIGURES):
             row[name] = digits(measured[name].mean()) if len(measured) else "-"
             row[name] += f" ({digits(LECTURE[arm][i])})" if arm in LECTURE else ""
-        row["score_iqm [95 %]"] = iqm_with_interval([measured["score_mean"].to_numpy()])
+        row["score_iqm [95 %]"] = iqm_with_interval(measured["score_mean"].to_numpy())
         rows.append(row)
     return pd.DataFrame(rows).rename(columns=lambda name: name.replace("_", " "))
 
@@ -293,9 +276,6 @@ def print_tables(tests: pd.DataFrame, markdown: bool) -> None:
         others = sorted(set(alike["arm"]) - LECTURE.keys())
         if others:
             print_table("Other arms", make_table(alike, others, list(vars(STANDARD))), markdown)
-        five_games = human_normalised(alike)
-        if five_games != "-":
-            print(f"Five games, human-normalised score, IQM [95 %]: {five_games}\n")
 
 
 def draw_curves(run_dirs: list[Path], file: str) -> None:

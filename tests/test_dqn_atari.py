@@ -220,12 +220,10 @@ def test_a_game_against_the_bare_emulator(env_id, repeat, pool, limit, size):
     while not ale.game_over():
         assert abs(decode([state])[0].numpy() - history[-4:]).max() < 1.1  # rounded twice
         action = int(rng.integers(len(meanings)))
-        screens, raw = [], 0
-        for _ in range(repeat):
-            if not ale.game_over():
-                raw += ale.act(getattr(ale_py.Action, meanings[action]))
-                screens.append(ale.getScreenRGB())
-        history.append(naive_frame(screens))
+        name = getattr(ale_py.Action, meanings[action])
+        acted = [(ale.act(name), ale.getScreenRGB()) for _ in range(repeat) if not ale.game_over()]
+        history.append(naive_frame([screen for _, screen in acted]))
+        raw = sum(reward for reward, _ in acted)
         rewards.append(raw)
         lives.append(ale.lives())
         state, reward, terminated, truncated, info = train.step(action)
@@ -235,25 +233,26 @@ def test_a_game_against_the_bare_emulator(env_id, repeat, pool, limit, size):
         assert not truncated and state[-1] == test_state[-1]
         if terminated and not ale.game_over():
             assert "episode" not in info
-            number, last = train.unwrapped.ale.getEpisodeFrameNumber(), state[-1]
-            state, _ = train.reset()
-            assert train.unwrapped.ale.getEpisodeFrameNumber() == number
-            assert state == (last,) * 4
+            number = train.unwrapped.ale.getEpisodeFrameNumber()
+            state, last = train.reset()[0], state[-1]
+            assert train.unwrapped.ale.getEpisodeFrameNumber() == number and state == (last,) * 4
             history, lost = [history[-1]] * 4, lost + 1
     assert lost == lives[0] - 1 > 1 and (max(rewards) > 1 or "Breakout" in env_id)
     for statistics in (info["episode"], test_info["episode"]):
         assert (statistics["r"], statistics["l"]) == (sum(rewards), len(rewards))
     train.reset()
-    assert train.unwrapped.ale.lives() == lives[0]
-    assert train.unwrapped.ale.getEpisodeFrameNumber() <= 30
-    assert train.unwrapped.ale.getInt("max_num_frames_per_episode") == 108_000
+    ale = train.unwrapped.ale
+    assert ale.lives() == lives[0] and ale.getEpisodeFrameNumber() <= 30
+    assert ale.getInt("max_num_frames_per_episode") == 108_000
+    train.set_wrapper_attr("lives", lives[0] - 1)
+    assert not train.step(0)[2]  # a life more, a bonus, ends no episode
 
 
 def test_actions_are_four_directions_and_fire_when_centred():
     for game, names in (("Riverraid", "NOOP FIRE UP RIGHT LEFT DOWN"),
                         ("Enduro", "NOOP FIRE RIGHT LEFT DOWN")):
-        env = environment(False, f"{game}NoFrameskip-v4")
-        assert env.get_wrapper_attr("meanings") == names.split()
+        meanings = environment(False, f"{game}NoFrameskip-v4").get_wrapper_attr("meanings")
+        assert meanings == names.split()
 
 
 def test_no_ops_are_0_to_30_from_the_seed():
@@ -430,6 +429,8 @@ def test_rmsprop_is_the_one_that_nature_released():
             n[i] = 0.95 * n[i] + 0.05 * d * d
             naive[i] -= 0.1 * d / math.sqrt(n[i] - g[i] ** 2 + 0.01)
         assert θ.tolist() == pytest.approx(naive, rel=1e-5)
+        saved, optimizer = optimizer.state_dict(), type(optimizer)([θ], lr=9)
+        optimizer.load_state_dict(saved)  # a run that is stopped, and resumed
 
 
 @pytest.mark.parametrize("bfloat16, choice", [(0.5, "bfloat16"), (0.95, "float32"), (2, "float32")])
@@ -501,12 +502,11 @@ def test_dead_units_are_0_in_all_states():
 
 
 def test_mean_variance_and_first_and_last_tenth_by_hand(tmp_path):
-    counters = dqn.Counters(frames=3, updates=2, episodes=1, seconds=1.25)
+    counters = dqn.Counters(frames=3, updates=2, episodes=1, seconds=1.25, speeds=[*range(20)])
     row = dqn.summary(counters, [(1.0, 10), (4.0, 20), (7.0, 60)])
     assert row == {"frames": 3, "updates": 2, "episodes": 1, "score_mean": 4, "score_variance": 9,
                    "length_mean": 30, "length_variance": pytest.approx(700), "seconds": 1.2}
     assert dqn.summary(counters, [(1.0, 10)])["score_variance"] == 0
-    counters.speeds = list(range(20))
     dqn.write_test(tmp_path / "test.json", counters, [])
     test = json.loads((tmp_path / "test.json").read_text())
     assert [test[f"frames_per_second_{x}_tenth"] for x in ("first", "last")] == [0.5, 18.5]
