@@ -37,8 +37,9 @@ Deviations
     squared error (Algorithm 6, line 22)  Huber loss                          §5.3
     [8]: acts at random before learning   ε falls from the first frame        Algorithm 6
     [8]'s code: all weights uniform       orthogonal convolution filters      §7.5.1, Table 4
-    [8]'s code: an episode's first        copies of its first frame           an empty frame is
-    states have empty frames                                                  no screen of the game
+    [8]'s code: empty frames before x₀    copies of x₀                        x₀ is a screen
+    [8]'s code: all minimal actions       those of FIRE and four directions   §7.3.3
+    [8] tests the best evaluation's θ     the last θ                          no choice by score
     [8]'s code: screens averaged by area  bilinear, without antialiasing      §7.2.1 says bilinear
     Algorithm 6: reset after a lost life  the game goes on, without the       later lives are
     (§7.2.1)                              no-operations of [8]'s code         played, too
@@ -85,7 +86,7 @@ class Args:
 
     # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
-    """frames to train for [8: 50,000,000]"""
+    """frames to train for, each an action of 4 emulator frames [8: 50,000,000]"""
     environment_evaluation_episodes: int = 10
     """games of an evaluation"""
     environment_evaluation_interval_episodes: int = 500
@@ -192,8 +193,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
-    DOWN (§7.3.3). Their names: `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones that are among NOOP, FIRE, UP,
+    RIGHT, LEFT and DOWN (§7.3.3). `meanings` are their names."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -207,7 +208,8 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A game starts with 0 to `no_op_max` no-operations, emulator frames, from `rng` (§7.2.1)."""
+    """A game starts with 0 to `no_op_max` no-operations of an emulator frame each, drawn from `rng`
+    (§7.2.1). FIRE is not pressed for the agent: it learns to."""
 
     def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
@@ -288,7 +290,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     """The game with the transformations of Figure 16 (training) or 17 (evaluation: no clipping,
     no LifeLoss); FrameHistory comes on top.
 
-    Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
+    Nothing is skipped or repeated at random; after 108,000 emulator frames, half an hour, a game is
+    truncated.
     Exits with one line for a name that is no Atari game.
     """
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
@@ -363,11 +366,12 @@ class ReplayMemory:
     def state_dict(self) -> dict:
         """For a checkpoint: every frame once, and per transition the places of its frames. Two
         transitions (A, B, C, D, E) and (B, C, D, E, F) become ABCDEF, 0 1 2 3 4 and 1 2 3 4 5."""
-        stored = self.frames[: len(self)]  # a frame that transitions share is one object
+        stored = self.frames[: len(self)]  # (n, 5); a frame that transitions share is one object
         unique = {id(frame): frame for frames in stored for frame in frames}
         place = dict(zip(unique, range(len(unique)), strict=True))
         return {
             "added": self.added,
+            # (n, 3) float32, (n, 5) int64; (frames,) int64, (bytes,) uint8: all frames, joined
             "numbers": torch.from_numpy(self.numbers[: len(self)]),
             "places": torch.tensor([[place[id(x)] for x in frames] for frames in stored]),
             "lengths": torch.tensor([len(frame) for frame in unique.values()]),
@@ -482,8 +486,8 @@ class NatureRMSprop(torch.optim.Optimizer):
                 # g ← 0.95 g + 0.05 ∇    n ← 0.95 n + 0.05 ∇²    θ ← θ - lr ∇ / √(n - g² + 0.01)
                 g = state["g"].lerp_(θ.grad, 1 - group["decay"])
                 n = state["n"].lerp_(θ.grad.square(), 1 - group["decay"])
-                variance = (n - g.square()).clamp_min(0)  # rounding could make it negative
-                root = (variance + group["constant"]).sqrt()
+                # Rounding could make the variance, n - g², negative.
+                root = ((n - g.square()).clamp_min(0) + group["constant"]).sqrt()
                 θ.addcdiv_(θ.grad, root, value=-group["lr"])
 
 
@@ -523,11 +527,11 @@ def dead_units(q_network: QNetwork, states: torch.Tensor) -> float:
 # ---- evaluation ----------------------------------------------------------------------------------
 
 
-def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
     """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
     frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
-    the final test, does not. Seed and number alone decide all that is random. Returns (score,
-    length in frames) of every game that has ended."""
+    the final test, does not. Seed and number alone decide all that is random. Returns a list,
+    (score, length in frames) of every game that has ended, and both so far of the one cut off."""
     games = args.environment_evaluation_episodes if number else math.inf
     # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
     # [seed, number + 1].
@@ -544,7 +548,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             state, _ = env.reset()
         if len(finished) == games:
             break
-    return finished
+    return finished, [*map(env.get_wrapper_attr, ("episode_returns", "episode_lengths"))]
 
 
 # ---- report and checkpoint -----------------------------------------------------------------------
@@ -573,21 +577,21 @@ def summary(counters, finished: list[tuple[float, int]]) -> dict:
     return row | {"seconds": round(counters.seconds, 1)}
 
 
-def write_test(path: Path, counters: Counters, finished: list) -> None:
-    """test.json: the final test, the mean of the last five evaluations (one θ is a noisy result),
-    and how fast the first and the last tenth of the learning frames were."""
+def write_test(path: Path, counters: Counters, finished: list, unfinished: list) -> None:
+    """test.json: the final test, how fast the first and the last tenth of the learning frames were,
+    and the mean of the last five evaluations: one θ is a noisy result."""
     evaluations = [row["score_mean"] for row in counters.evaluations[-5:]] or [math.nan]
     tenth = math.ceil(len(counters.speeds) / 10)  # a run that slows down shows here
     result = summary(counters, finished) | {
-        "last_evaluations_score_mean": float(np.mean(evaluations)),
         "frames_per_second_first_tenth": float(np.median(counters.speeds[:tenth] or [math.nan])),
         "frames_per_second_last_tenth": float(np.median(counters.speeds[-tenth:] or [math.nan])),
-        "scores": [score for score, _ in finished],
-        "lengths": [length for _, length in finished],
+        "unfinished_score_and_length": unfinished,  # of the game that was cut off: not counted
+        "last_evaluations_score_mean": float(np.mean(evaluations)),
     }
     print("\n".join(f"{name:32}{value}" for name, value in result.items()))
-    # JSON has no NaN.
-    write_file(path, lambda p: p.write_text(json.dumps(result, indent=2).replace("NaN", "null")))
+    games = {"scores": [score for score, _ in finished], "lengths": [n for _, n in finished]}
+    text = json.dumps(result | games, indent=2).replace("NaN", "null")  # JSON has no NaN
+    write_file(path, lambda p: p.write_text(text))
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
@@ -622,7 +626,7 @@ def restore_environment(env: gym.Env, saved: dict) -> None:
 
 def restore(path: Path, parts: dict, env: gym.Env, rngs: list[np.random.Generator]) -> Counters:
     """Put everything back to where the checkpoint was taken. weights_only, as a pickle can run a
-    program. Exits with one line if the file is not whole, or not of this run."""
+    program. Exits with one line if the file is not whole, or does not fit this run."""
     try:
         if zipfile.ZipFile(path).testzip():
             raise ValueError("a checksum is wrong")
@@ -763,7 +767,7 @@ def main(args: Args) -> None:
 
         # 27-29  Evaluate the agent.
         if episode_ended and counters.episodes % args.environment_evaluation_interval_episodes == 0:
-            finished = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
             table = pd.DataFrame(counters.evaluations).set_index("frames")
             write_file(run_dir / "evaluations.csv", table.to_csv)
@@ -777,7 +781,8 @@ def main(args: Args) -> None:
         bar.update()
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
-            # Evaluations and files included.
+            # SPS: frames a second, evaluations and files included. td_loss: the mean Huber loss of
+            # the last minibatch; q_values: the mean of its Q(s_j, a_j).
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
             # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
@@ -801,8 +806,8 @@ def main(args: Args) -> None:
         raise SystemExit(128 + stop[0])  # the shell's code for a signal
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
-    finished = evaluate(args, q_network, replay.decode, number=0)
-    write_test(run_dir / "test.json", counters, finished)
+    finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
+    write_test(run_dir / "test.json", counters, finished, unfinished)
 
 
 if __name__ == "__main__":

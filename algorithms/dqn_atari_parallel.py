@@ -9,8 +9,8 @@ r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544N
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
 ReplayShare, epsilon_greedy_batch, passed, learn and main; the rest is dqn_atari.py's, word for
 word. It drops exact resume, the lock on a run, checksums, RMSProp, --threads, the choice of the
-precision, all curves but those of games, the speeds, lengths and last evaluations of test.json.
-[8] is Mnih et al., Nature 518 (2015).
+precision, all curves but those of games, and of test.json all but the summary and the scores.
+[8] is Mnih et al., Nature 518 (2015). The flags up to --optimizer-learning-rate are Table 3's.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step: a frame each
     learner       act|  updates   act|  updates   act|    N actions, one batch; it learns meanwhile
@@ -87,7 +87,7 @@ class Args:
 
     # Table 3, in its order
     environment_train_frames_max: int = 10_000_000
-    """frames to train for [8: 50,000,000]"""
+    """frames to train for, each an action of 4 emulator frames [8: 50,000,000]"""
     environment_evaluation_episodes: int = 10
     """games of an evaluation"""
     environment_evaluation_interval_episodes: int = 500
@@ -194,8 +194,8 @@ def read_args() -> Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
-    DOWN (§7.3.3). Their names: `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones that are among NOOP, FIRE, UP,
+    RIGHT, LEFT and DOWN (§7.3.3). `meanings` are their names."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -209,7 +209,8 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A game starts with 0 to `no_op_max` no-operations, emulator frames, from `rng` (§7.2.1)."""
+    """A game starts with 0 to `no_op_max` no-operations of an emulator frame each, drawn from `rng`
+    (§7.2.1). FIRE is not pressed for the agent: it learns to."""
 
     def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
@@ -290,7 +291,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     """The game with the transformations of Figure 16 (training) or 17 (evaluation: no clipping,
     no LifeLoss); FrameHistory comes on top.
 
-    Nothing is skipped or repeated at random; after 108,000 emulator frames a game is truncated.
+    Nothing is skipped or repeated at random; after 108,000 emulator frames, half an hour, a game is
+    truncated.
     Exits with one line for a name that is no Atari game.
     """
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
@@ -468,11 +470,11 @@ def passed(count: int, step: int, interval: int) -> int:
 # ---- evaluation ----------------------------------------------------------------------------------
 
 
-def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> list:
+def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
     """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
     frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
-    the final test, does not. Seed and number alone decide all that is random. Returns (score,
-    length in frames) of every game that has ended."""
+    the final test, does not. Seed and number alone decide all that is random. Returns a list,
+    (score, length in frames) of every game that has ended, and both so far of the one cut off."""
     games = args.environment_evaluation_episodes if number else math.inf
     # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
     # [seed, number + 1].
@@ -489,7 +491,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
             state, _ = env.reset()
         if len(finished) == games:
             break
-    return finished
+    return finished, [*map(env.get_wrapper_attr, ("episode_returns", "episode_lengths"))]
 
 
 # ---- report and checkpoint -----------------------------------------------------------------------
@@ -648,7 +650,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
 
         # 27-29  Evaluate the agent.
         if passed(counters.episodes, ends, args.environment_evaluation_interval_episodes):
-            finished = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
+            finished, _ = evaluate(args, q_network, replay.decode, len(counters.evaluations) + 1)
             counters.evaluations.append(summary(counters, finished))
             table = pd.DataFrame(counters.evaluations).set_index("frames")
             write_file(run_dir / "evaluations.csv", table.to_csv)
@@ -670,7 +672,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     if rank == 0 and not (stopping or signals):
-        finished = evaluate(args, q_network, replay.decode, number=0)
+        finished, _ = evaluate(args, q_network, replay.decode, number=0)
         test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
         text = json.dumps(test, indent=2).replace("NaN", "null")  # JSON has no NaN

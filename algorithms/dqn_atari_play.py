@@ -14,7 +14,7 @@ Run it
     python algorithms/dqn_atari_play.py                    # the newest run under runs/
     python algorithms/dqn_atari_play.py --game pong --games 30   # mean and variance, no pictures
 
-In the folder play-seed1 beside q_network.pt, or in --output; an earlier game there gives way:
+In the folder play-seed1 beside q_network.pt, or in --output, an earlier game's files are replaced:
     episode.webm   the game, 15 frames a second, with Q of every action and the value beside it
     play.gif       its first twelve seconds; 0.4 to 0.7 MB, by game
     values.png     Figure 20: value, Q of every action and best action against the frame
@@ -96,8 +96,8 @@ class Args:
 
 
 class JoystickActions(gym.ActionWrapper):
-    """Of up to eighteen actions (§5.3) the game's minimal ones within NOOP, FIRE, UP, RIGHT, LEFT,
-    DOWN (§7.3.3). Their names: `meanings`."""
+    """Of up to eighteen actions (§5.3) the game's minimal ones that are among NOOP, FIRE, UP,
+    RIGHT, LEFT and DOWN (§7.3.3). `meanings` are their names."""
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
@@ -111,7 +111,8 @@ class JoystickActions(gym.ActionWrapper):
 
 
 class NoOpReset(gym.Wrapper):
-    """A game starts with 0 to `no_op_max` no-operations, emulator frames, from `rng` (§7.2.1)."""
+    """A game starts with 0 to `no_op_max` no-operations of an emulator frame each, drawn from `rng`
+    (§7.2.1). FIRE is not pressed for the agent: it learns to."""
 
     def __init__(self, env: gym.Env, no_op_max: int, rng: np.random.Generator):
         super().__init__(env)
@@ -174,8 +175,8 @@ class KeepScreen(gym.ObservationWrapper):
 def make_evaluation_env(trained, no_op_rng: np.random.Generator) -> gym.Env:
     """The game with the transformations of Figure 17, as in dqn_atari.py: a whole game, raw reward.
 
-    `trained` are the flags of the training. Nothing is skipped or repeated at random; after 108,000
-    emulator frames a game is truncated.
+    `trained` holds the flags of the training. Nothing is skipped or repeated at random; after
+    108,000 emulator frames, half an hour, a game is truncated.
     """
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
     gym.register_envs(ale_py)  # gives Gymnasium the names; the ROMs are in ale-py's wheel
@@ -241,11 +242,12 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         trained = types.SimpleNamespace(**content["args"], actions=content["actions"])
         no_ops, repeat = trained.environment_no_op_max, trained.agent_action_repeat
-        # A hostile file: Gymnasium would import what stands before a colon, or reset for ever.
+        # Against hostile files: Gymnasium imports the module before a colon in env_id, and billions
+        # of no-operations would never end.
         if ":" in trained.env_id or no_ops > 1_000 or repeat > 100:
             raise ValueError("its game has a module's name, or too many no-operations or repeats")
         shape = trained.environment_state_height, trained.environment_state_width
-        with torch.device("meta"):  # shapes alone; the file's tensors come if they fit
+        with torch.device("meta"):  # shapes alone; the file's tensors are assigned if they fit
             q_network = QNetwork(trained.agent_history_length, *shape, len(trained.actions))
         q_network.load_state_dict(content["q_network"], assign=True)
         q_network.float()  # published weights may be in half precision
@@ -254,7 +256,7 @@ def load(path: Path) -> tuple[QNetwork, types.SimpleNamespace]:
         env.reset()
         q = action_values(q_network, env.step(0)[0], trained)  # (num_actions,)
         if env.get_wrapper_attr("meanings") != trained.actions or not np.isfinite(q).all():
-            raise ValueError("its actions are not the game's, or its Q is no number")
+            raise ValueError("its actions are not the game's, or its Q is not finite")
     except Exception as error:  # a damaged or hostile file can raise anything
         raise SystemExit(f"error: {path} cannot be played: {error!r:.200}") from None
     return q_network, trained
@@ -294,8 +296,8 @@ def play(env: gym.Env, q_network: QNetwork, trained, epsilon: float, rng, seed: 
 
 
 def largest_jumps(values: np.ndarray, count: int = 3) -> list[int]:
-    """The frames t, in order of time, of the `count` largest |V(s_t) - V(s_{t-1})| of values (T,).
-    They lie at least a second apart, for different events; each has a frame before and after."""
+    """The `count` frames t with the largest |V(s_t) - V(s_{t-1})| in values (T,), in order of time.
+    They are at least a second apart, for different events; each has a frame before and after."""
     changes = np.abs(np.diff(values))[:-1]  # (T - 2,): index t - 1 is the jump into frame t
     moments = []
     for t in 1 + np.argsort(-changes, kind="stable"):
@@ -311,7 +313,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # after its action
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # frame after the loss
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")
@@ -320,9 +322,9 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     t = np.flatnonzero(rewards)
     signs = np.where(rewards[t] > 0, "tab:green", "tab:red")
     top.scatter(t, value[t], 20, signs, zorder=3, label="reward (red: below 0)")
-    up = top.get_xaxis_transform()  # x in frames, y from 0 to 1
-    top.vlines(lost, 0, 1, "tab:red", label="lost life" if len(lost) else "", transform=up)
-    top.vlines(moments, 0, 1, "black", "dotted", label="moments.png", transform=up)
+    full_height = top.get_xaxis_transform()  # x in frames, y from 0 to 1
+    top.vlines(lost, 0, 1, "tab:red", label="lost life" if len(lost) else "", transform=full_height)
+    top.vlines(moments, 0, 1, "black", "dotted", label="moments.png", transform=full_height)
     for number, name in enumerate(trained.actions):
         middle.plot(q[:, number], color=COLOURS[number], linewidth=0.8, label=name)
     bottom.scatter(np.arange(len(best)), best, 60, np.take(COLOURS, best), marker="|", lw=1)
@@ -352,14 +354,14 @@ def draw_moments(rows: list[dict], screens: list[bytes], moments: list[int]) -> 
 
 def picture(screen: bytes) -> Image.Image:
     """A screen of LZ4 bytes: 160 wide, 210 high; a few games have 250 lines."""
-    pixels = np.frombuffer(lz4.block.decompress(screen), np.uint8)
+    pixels = np.frombuffer(lz4.block.decompress(screen), np.uint8)  # (210·160·3,)
     return Image.fromarray(pixels.reshape(-1, 160, 3))
 
 
 def pictures(rows: list, q: np.ndarray, screens: list, trained) -> Iterator[Image.Image]:
-    """A picture for every row: the screen, and what the agent thinks. Bars start at Q = 0, the best
-    action stands in a box, a dot is at the one taken (red: drawn at random); below is the value of
-    the last 12 seconds, with dots at rewards (red: below 0). One scale for the whole game."""
+    """A picture for every row: the screen, and beside it Q of every action. Bars start at Q = 0,
+    the best action is framed, a dot marks the one taken (red: drawn at random). Below, the value of
+    the last 12 seconds, with dots at rewards (red: below 0). The scales are the whole game's."""
     large, small = ImageFont.load_default(24), ImageFont.load_default(16)
     value = q.max(axis=1)  # (T,)
     bar_scale, curve_scale = (min(q.min(), 0), max(q.max(), 0)), (value.min(), value.max())
@@ -393,8 +395,8 @@ def pictures(rows: list, q: np.ndarray, screens: list, trained) -> Iterator[Imag
 
 
 def write_video(folder: Path, images: Iterator[Image.Image]) -> None:
-    """episode.webm, in VP8, which browsers play; play.gif of its beginning, which starts again for
-    ever, in the colours of its first and last image."""
+    """episode.webm, in VP8, which browsers play; and play.gif, its beginning as an endless loop, in
+    the colours of its first and last image."""
     stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)  # OpenCV has a needless remark on VP8
     codec = cv2.VideoWriter_fourcc(*"VP80")
@@ -436,10 +438,10 @@ def main(args: Args) -> None:
     for seed in range(args.seed, args.seed + args.games):
         rows, q, screens = play(env, q_network, trained, args.epsilon, exploration_rng, seed)
         results.append((sum(row["reward"] for row in rows), len(rows)))
-        print(f"game {len(results)}: score {results[-1][0]:g}, {len(rows):,} frames")
+        print(f"game {len(results)}: score {results[-1][0]:,.0f}, {len(rows):,} frames")
     if args.games > 1:
         for name, values in zip(("score", "length"), np.transpose(results), strict=True):
-            print(f"{name:6}  mean {values.mean():.5g}, variance {values.var(ddof=1):.5g}")
+            print(f"{name:6}  mean {values.mean():,.2f}, variance {values.var(ddof=1):,.1f}")
         return
 
     folder = Path(args.output or path.parent / f"play-seed{args.seed}")
@@ -447,8 +449,8 @@ def main(args: Args) -> None:
     shown = rows[: int(args.video_seconds * FRAMES_PER_SECOND)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        table = pd.DataFrame(rows)
-        table.to_csv(folder.absolute() / "trace.csv", index=False, float_format="%.6g")
+        trace = folder.absolute() / "trace.csv"  # absolute: pandas expands a ~
+        pd.DataFrame(rows).to_csv(trace, index=False, float_format="%.6g")
         draw_curves(rows, q, moments, trained).savefig(folder / "values.png", dpi=100)
         draw_moments(rows, screens, moments).savefig(folder / "moments.png", dpi=100)
         write_video(folder, pictures(shown, q, screens, trained))

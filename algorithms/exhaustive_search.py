@@ -15,8 +15,8 @@ Measured
     The first command evaluates 3 policies and finds π1 with V(s0) = 11.
 
 Deviations
-    A policy chooses actions only where it comes to: of Figure 5 there are three, as in §4.2, which
-    bounds them by Π_s |A_s|, here 2 · 1 · 2 = 4.
+    A policy needs actions only in states that it reaches: Figure 5 has three policies, as in §3.2.
+    The bound of §4.2, Π_s |A_s|, is 2 · 1 · 2 = 4 here.
     Every evaluation starts from the values of the policies before it, as §4.2 suggests. Each policy
     is also evaluated from V = 0, to show how many sweeps that saves.
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount). A policy that
@@ -72,8 +72,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
-# belongs to action a in state s. Figure 5:
+# The model as arrays (`arrays`, below), for S states with at most A actions each: P (A·S, S) is
+# sparse, its row a·S + s belongs to action a in state s; R (A, S) holds the expected rewards, here
+# written as a column beside P. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -82,21 +83,21 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 #     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
 #     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
 # A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
-# chance to go on, and sG has no row, no column, and V = 0.
+# probability to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: exhaustive search ----------------------------------------------------------------
 
 
 def policies(P: sparse.csr_array, R: np.ndarray, start: np.ndarray) -> Iterator[np.ndarray]:
-    """Every policy (S,) int once: an action in each state that it reaches, -1 elsewhere."""
+    """Every policy once, (S,) int: the index of an action in each state it reaches, else -1."""
     stack = [np.full(len(start), -1)]  # of (S,)
     while stack:
         policy = stack.pop()
-        # Actions are chosen only in states that it reaches: s0 at first, s2 only after a2 in s0.
+        # A state needs an action only once it is reached: s0 at first, s2 only after a2 in s0.
         decided = np.flatnonzero(policy >= 0)  # indices of states
         reached = (start > 0) | (P[policy[decided] * len(policy) + decided].sum(axis=0) > 0)  # (S,)
-        undecided = np.flatnonzero(reached & (policy < 0))
+        undecided = np.flatnonzero(reached & (policy < 0))  # indices of states
         if len(undecided) == 0:
             yield policy
             continue
@@ -107,14 +108,14 @@ def policies(P: sparse.csr_array, R: np.ndarray, start: np.ndarray) -> Iterator[
 
 
 def evaluate_policy(P, R, policy, warm: np.ndarray, args: Args) -> tuple[np.ndarray, int, int]:
-    """Of π (S,): V^π (S,), which is NaN where π never comes, the number of sweeps that it took from
-    `warm` (S,), and how many it takes from V = 0."""
+    """Of π (S,): V^π (S,), which is NaN in states that π never reaches, the number of sweeps that
+    it took from `warm` (S,), and how many it takes from V = 0."""
     states = np.flatnonzero(policy >= 0)  # (n,)
     rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
     P_π, R_π = P[rows][:, states], R[policy[states], states]  # (n, n), (n,)
     live = live_states(P_π, R_π, args.discount)  # (n,)
-    V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
     states, P_π, R_π = states[live], P_π[live][:, live], R_π[live]  # (m,), (m, m), (m,)
+    V = np.where(policy >= 0, 0.0, np.nan)  # (S,)
     V[states], sweeps = iterative_policy_evaluation(P_π, R_π, warm[states], args)
     _, sweeps_from_0 = iterative_policy_evaluation(P_π, R_π, np.zeros(len(states)), args)
     return V, sweeps, sweeps_from_0
@@ -146,7 +147,7 @@ def iterative_policy_evaluation(P, R, V, args: Args) -> tuple[np.ndarray, int]:
     P (n, n) and R (n,) are the policy's own. Exits if V has not converged after --max-iterations.
     """
     for sweep in trange(1, args.max_iterations + 1, desc="sweeps", delay=2, leave=False):
-        # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
+        # V_{i+1}(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + args.discount * (P @ V), V  # (n,)
         if (np.abs(V - V_old) <= args.tolerance * np.maximum(1, np.abs(V))).all():
             return V, sweep
@@ -160,12 +161,12 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return np.add(R, future, out=future)  # R + future, in place: a new array takes time
 
 
-def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    may, before = goal, None  # in 0 steps
-    while not np.array_equal(may, before):
-        may, before = may | (P @ may > 0), may  # in one step more
-    return may
+def can_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
+    """(n,) bool: the states from which a state of `goal` (n,) bool can be reached by P (n, n)."""
+    reaches, before = goal, None  # in 0 steps
+    while not np.array_equal(reaches, before):
+        reaches, before = reaches | (P @ reaches > 0), reaches  # in one step more
+    return reaches
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -177,10 +178,10 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
-    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected. Where one
-    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
-    ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
+    live = can_reach(P, np.abs(R) > 1e-9)  # a reward other than 0 can still come
+    # An end is a transition that terminates, or a state after which no reward comes. If one can be
+    # reached from every state, π reaches one with probability 1: there are finitely many states.
+    ends = can_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
@@ -223,7 +224,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # it goes on; else an error
+                    if {False: True, True: False}[terminated]:  # `not`; an error for no bool
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -236,7 +237,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
+    instead; in states that π never reaches, V is NaN and π is -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -260,7 +261,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 def main(args: Args) -> None:
     """Try every policy of the MDP that the flags name, and report the best."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) or 1, 0, …
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,), else 1, 0, 0, …
     policy, V, tried = exhaustive_search(P, R, start, args)
     for i, (π, counts) in enumerate(zip(policies(P, R, start), tried[:10], strict=False), start=1):
         actions = [f"{s}={list(model[s])[a]}" for s, a in zip(model, π, strict=True) if a >= 0]

@@ -59,8 +59,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
-# belongs to action a in state s. Figure 5:
+# The model as arrays (`arrays`, below), for S states with at most A actions each: P (A·S, S) is
+# sparse, its row a·S + s belongs to action a in state s; R (A, S) holds the expected rewards, here
+# written as a column beside P. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -69,37 +70,37 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 #     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
 #     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
 # A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
-# chance to go on, and sG has no row, no column, and V = 0.
+# probability to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: linear program -------------------------------------------------------------------
 
 
 def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
-    """Equation 27 as a linear program: V* (S,), and the solver's iterations.
+    """Equation 27 as a linear program: V* (S,), and the solver's iterations. Exits without a V*.
 
-    V(s) is at least the right-hand side of Equation 27 for every action, so at least its maximum.
-    The smallest such V is V*: in each state the inequality of one action is an equation. Exits if
-    there is none.
+    V(s) ≥ the sum in Equation 27 for each action a means V(s) ≥ their maximum. V* is the smallest
+    such V: if V(s) were above the maximum in some state, V(s) could be lowered.
     """
     # min Σ_s V(s)  subject to  V(s) ≥ R(s, a) + γ Σ_s' P(s'|s, a) V(s')  for all s and a,
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
     exists = np.isfinite(R.ravel())  # (A·S,)
     E = sparse.vstack([sparse.eye_array(R.shape[1])] * len(R))  # (A·S, S)
-    A, b = (discount * P - E).tocsr()[exists], -R.ravel()[exists]
-    # The solver's own 1e-7 cannot tell close actions apart; beside a reward of 1e9, 1e-10 cannot be
-    # asked for: a float64 has 16 digits.
-    digits = float(np.clip(1e-16 * np.abs(b).max(), 1e-10, 1e-7))
-    tolerances = {"primal_feasibility_tolerance": digits, "dual_feasibility_tolerance": 1e-10}
+    A, b = (discount * P - E).tocsr()[exists], -R.ravel()[exists]  # a row, a number an action
+    # The solver's default tolerance, 1e-7, cannot tell close actions apart; 1e-10 can. A float64
+    # has 16 digits, though: beside a reward of 1e9 no solver reaches 1e-10, so ask for less there.
+    tolerance = float(np.clip(1e-16 * np.abs(b).max(), 1e-10, 1e-7))
+    tolerances = {"primal_feasibility_tolerance": tolerance, "dual_feasibility_tolerance": 1e-10}
     # Easy to get wrong: where the agent can stay for ever for nothing, V ≥ 0. At discount 1 the
     # inequality of an action that stays in s, V(s) ≥ 0 + V(s), does not say so.
-    bounds = [(0 if idle.any() else None, None) for idle in idle_actions(P, R).T]  # (S, 2)
-    program = optimize.linprog(np.ones(len(bounds)), A, b, bounds=bounds, options=tolerances)
+    idle = idle_actions(P, R).any(axis=0) & (discount == 1)  # (S,)
+    bounds = [(0 if can_idle else None, None) for can_idle in idle]  # (S, 2)
+    result = optimize.linprog(np.ones(len(bounds)), A, b, bounds=bounds, options=tolerances)
     # Infeasible: no finite V is large enough, V* is +∞ somewhere. Unbounded: V can fall without
     # limit, V* is -∞ somewhere, or there is none: rewards of -1 and 1 in turns for ever.
-    if program.x is None:
-        raise SystemExit(f"error: V* is not found: {program.message.splitlines()[0]}")
-    return program.x + 0.0, int(program.nit)  # (S,); -0.0 becomes 0.0
+    if result.x is None:
+        raise SystemExit(f"error: V* is not found: {result.message.splitlines()[0]}")
+    return result.x + 0.0, int(result.nit)  # (S,); -0.0 becomes 0.0
 
 
 def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -> np.ndarray:
@@ -110,29 +111,29 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
-    that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
-    and V is 0).
+    """At discount 1: π (S,) int, a best action in each state. Of best actions that tie, π takes the
+    one that ends soonest: the episode ends, or all rewards do (in states with V = 0 where π can
+    stay for ever).
 
-    Exits if the best actions of a state lead to no end.
+    Exits if from some state no best action leads to an end.
     """
-    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
-    # tie, and an argmax may walk to and fro for ever.
+    # Easy to get wrong: if the only reward is at the goal, walking to and fro ties with walking to
+    # the goal, and an argmax may choose to walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 that the agent need not leave. At first it has all
-    # of them; then those go from which every best action may lead out of it.
+    # Rest: the largest set of states with V = 0 in which the agent can stay for ever. Start with
+    # all states with V = 0; while every best action of one of them can lead out, drop that state.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): no chance to come elsewhere. An action that ends has none: its row of P is empty.
+        # (A, S): best actions that cannot lead out of rest. One that ends has an empty row in P.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
-    # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
+    # Which best action ends soonest? The values of a second MDP tell. It has only the best actions,
+    # a reward of 1 for an end, and a discount below 1, so that a later end is worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 < 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it comes to rest
+    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it converges
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if not V_end.all():
@@ -141,11 +142,11 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions of expected reward 0 that end, or lead for certain into the largest
-    set of states that the agent need never leave by such actions: to be idle is worth 0."""
-    idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
+    """(A, S) bool: the idle actions. Such an action has expected reward 0, and ends the episode or
+    leads only to states that have an idle action, too: the agent can idle for ever, for 0."""
+    idle, before = np.ones(R.shape[1], bool), None  # (S,) has an idle action; at first all do
     while not np.array_equal(idle, before):
-        # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
+        # |reward| + the probability to leave them, by one backup; ∞ where there is no action
         actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
         idle, before = actions.any(axis=0), idle
     return actions
@@ -188,7 +189,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # it goes on; else an error
+                    if {False: True, True: False}[terminated]:  # `not`; an error for no bool
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -208,7 +209,7 @@ def worked(transitions: list, discount: float, V: dict[str, str]) -> str:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
+    instead; in states that π never reaches, V is NaN and π is -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -240,6 +241,9 @@ def main(args: Args) -> None:
         for s, actions in model.items():
             for transitions in actions.values():
                 print(f"V({s}) ≥ {worked(transitions, args.discount, unknowns)}")
+        for s, idle in zip(model, idle_actions(P, R).T, strict=True):
+            if args.discount == 1 and idle.any():
+                print(f"V({s}) ≥ 0")
         print()
     # π*(s) = argmax_a Q*(s, a)  Equation 31
     policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)

@@ -19,8 +19,8 @@ Measured
 
 Deviations
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
-    At discount 1 V is 0 where nothing more is collected (rewards below 1e-9 count as none); a
-    policy that may collect for ever has no value. V is undefined where the policy never comes.
+    At discount 1, V is 0 where all expected rewards to come are 0 (to 1e-9), and a policy that may
+    get others for ever has no value: an error. V is undefined in states that π never reaches.
 """
 
 import json
@@ -72,8 +72,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
-# belongs to action a in state s. Figure 5:
+# The model as arrays (`arrays`, below), for S states with at most A actions each: P (A·S, S) is
+# sparse, its row a·S + s belongs to action a in state s; R (A, S) holds the expected rewards, here
+# written as a column beside P. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -82,7 +83,7 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 #     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
 #     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
 # A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
-# chance to go on, and sG has no row, no column, and V = 0.
+# probability to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: policy evaluation ----------------------------------------------------------------
@@ -91,8 +92,8 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 def policy_evaluation(P, R, policy, args: Args) -> tuple[np.ndarray, np.ndarray, int]:
     """V^π (S,) by Algorithm 1, V^π (S,) by the linear system, and the number of sweeps.
 
-    π (S,) int reaches n states; in the others it is -1, and V is NaN. In m of the n states V is
-    worked out; in the others it may collect nothing more, and V is 0.
+    π (S,) int has the index of an action in each of the n states that it reaches, elsewhere -1; V
+    is NaN there. V is computed in m of the n states. In the rest no more reward comes, and V is 0.
     """
     states = np.flatnonzero(policy >= 0)  # (n,)
     rows = policy[states] * len(policy) + states  # (n,) of P: a·S + s
@@ -112,7 +113,7 @@ def iterative_policy_evaluation(P, R, V, args: Args) -> tuple[np.ndarray, int]:
     P (n, n) and R (n,) are the policy's own. Exits if V has not converged after --max-iterations.
     """
     for sweep in trange(1, args.max_iterations + 1, desc="sweeps", delay=2, leave=False):
-        # V_i+1(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
+        # V_{i+1}(s) = Σ_s' P(s'|s, π(s)) [R(s, π(s), s') + γ V_i(s')]  Algorithm 1, line 7
         V, V_old = R + args.discount * (P @ V), V  # (n,)
         if (np.abs(V - V_old) <= args.tolerance * np.maximum(1, np.abs(V))).all():
             return V, sweep
@@ -123,8 +124,8 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     # (I - γ P) V = R
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
-    # For a large system BiCGSTAB, which approaches V step by step, in little memory. If it does not
-    # get there, and for small ones, a direct solver, whose memory may grow with n².
+    # For a large system BiCGSTAB, an iterative solver that needs little memory. For small ones, and
+    # where that does not converge, a direct solver, whose memory may grow with n².
     if len(R) > 1000:
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
@@ -139,12 +140,12 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
     return np.add(R, future, out=future)  # R + future, in place: a new array takes time
 
 
-def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    may, before = goal, None  # in 0 steps
-    while not np.array_equal(may, before):
-        may, before = may | (P @ may > 0), may  # in one step more
-    return may
+def can_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
+    """(n,) bool: the states from which a state of `goal` (n,) bool can be reached by P (n, n)."""
+    reaches, before = goal, None  # in 0 steps
+    while not np.array_equal(reaches, before):
+        reaches, before = reaches | (P @ reaches > 0), reaches  # in one step more
+    return reaches
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -156,10 +157,10 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
-    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected. Where one
-    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
-    ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
+    live = can_reach(P, np.abs(R) > 1e-9)  # a reward other than 0 can still come
+    # An end is a transition that terminates, or a state after which no reward comes. If one can be
+    # reached from every state, π reaches one with probability 1: there are finitely many states.
+    ends = can_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
@@ -202,7 +203,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # it goes on; else an error
+                    if {False: True, True: False}[terminated]:  # `not`; an error for no bool
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -236,7 +237,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
+    instead; in states that π never reaches, V is NaN and π is -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -256,7 +257,7 @@ def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residu
 
 def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: int) -> None:
     """Equation 3 of the states that π (S,) reaches, its solution `exact` (S,), and the lecture's
-    table of the first sweeps. π is -1 where it never comes."""
+    table of the first sweeps. π is -1 in states that it never reaches."""
     chosen = {s: list(model[s].values())[a] for s, a in zip(model, policy, strict=True) if a >= 0}
     unknowns = {s: f"V({s})" for s in model}
     for s, v in zip(chosen, exact[policy >= 0], strict=True):
@@ -279,19 +280,19 @@ def print_evaluation(model: dict, P, R, policy, discount: float, exact, sweeps: 
 def main(args: Args) -> None:
     """Evaluate the policy that the flags name (of Figure 5, all three), and report."""
     model, env, P, R = read_model(args)
-    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,) or 1, 0, …
+    start = getattr(env, "initial_state_distrib", np.eye(1, len(model))[0])  # (S,), else 1, 0, 0, …
     named = args.policy or args.model or args.env_id  # else π1, π2 and π3 of §3.2
     texts = [args.policy] if named else ["s0=a1 s1=a1", "s0=a2 s1=a1 s2=a1", "s0=a2 s1=a1 s2=a2"]
     for text in texts:
         policy = read_policy(text, model) if text else np.zeros(len(model), int)  # (S,)
         # The policy graph (§3.2): the states to which the start leads. In the transpose, where
-        # every step goes backwards, they are those that may reach the start.
+        # every step goes backwards, they are those that can reach the start.
         rows = policy * len(model) + np.arange(len(model))  # (S,) of P: a·S + s
-        reached = may_reach(P[rows].T, start > 0)  # (S,)
-        # Where π is -1, -S + s counts from the end: a row of the last action. To reach such a
-        # state is an error.
+        reached = can_reach(P[rows].T, start > 0)  # (S,)
+        # Where --policy names no action, π is -1 and the row is -S + s, counted from the end: one
+        # of the last action. No matter which: if such a state is reached, that is an error.
         if policy[reached].min() < 0:
-            raise SystemExit("error: --policy comes to a state for which it names no action")
+            raise SystemExit("error: --policy reaches a state for which it names no action")
         policy = np.where(reached, policy, -1)  # (S,)
         V, exact, sweeps = policy_evaluation(P, R, policy, args)
         if R.size <= 12:  # small enough to be worked through on paper

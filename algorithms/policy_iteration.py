@@ -13,17 +13,18 @@ Run it
     python algorithms/policy_iteration.py --initial-policy "s0=a2 s1=a1 s2=a2"
 
 Measured
-    The first command converges to V* = (11, 1, 4) and π* = (a1, a1, a2) with two policies; its
-    tables print the second twice, as the lecture's do. How V(s) comes about stands in Q(s, π(s)).
+    The first command evaluates two policies and finds V* = (11, 1, 4) and π* = (a1, a1, a2). As in
+    the lecture, the tables repeat the last. The arithmetic of V_i(s) is that of Q_i(s, π_i(s)).
 
 Deviations
     An action is changed only for a gain of more than 1e-9 · (1 + |V(s)|): of actions that tie, an
     argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed as the Bellman
     residual.
-    At discount 1 an action with which the agent can stay idle for ever has a Q of 0 at least. Where
-    V(s) = -9, Equation 29 gives it only 0 + V(s) = -9, a tie; so a table may have 1·[0 + -9] = 0.
-    The first policy is not random. At discount 1 a policy that collects for ever has no value, so
-    the first one ends, or stays somewhere for nothing; at another discount it is the first action.
+    At discount 1, Q(s, a) is raised to 0 for an action a with which the agent can idle for ever. If
+    V(s) = -9 and a stays in s for 0, Equation 29 gives Q(s, a) = 0 + V(s) = -9, a tie with V(s),
+    but idling is worth 0. Then a table prints 1·[0 + -9] = 0.
+    The initial policy is not random. Of Figure 5 it is π2, else the first action everywhere or, at
+    discount 1, where a policy that never ends may have no value, one that ends or idles.
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
 """
 
@@ -57,7 +58,7 @@ class Args:
     discount: float = 1.0
     """γ in [0, 1], the weight of a reward one step later"""
     initial_policy: str = ""
-    """such as "s0=a2 s1=a1 s2=a1", §4.4's π2; else, at discount 1, one that ends or is idle"""
+    """such as "s0=a2 s1=a1 s2=a1", §4.4's π2 and Figure 5's default; else see the deviations"""
     max_iterations: int = 1000
     """policies after which to give up"""
     output_json: Path | None = None
@@ -72,8 +73,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
-# belongs to action a in state s. Figure 5:
+# The model as arrays (`arrays`, below), for S states with at most A actions each: P (A·S, S) is
+# sparse, its row a·S + s belongs to action a in state s; R (A, S) holds the expected rewards, here
+# written as a column beside P. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -82,7 +84,7 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 #     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
 #     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
 # A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
-# chance to go on, and sG has no row, no column, and V = 0.
+# probability to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: policy iteration -----------------------------------------------------------------
@@ -109,7 +111,7 @@ def policy_iteration(P, R, policy, discount: float, max_iterations=1000) -> list
         live, V = live_states(P_π, R_π, discount), np.zeros(len(policy))  # (S,), (S,)
         V[live] = solve_system(P_π[live][:, live], R_π[live], discount)
         Q = backup(P, R, V, discount)  # (A, S)
-        Q[idle] = np.maximum(Q[idle], 0)  # to be idle for ever is worth 0, if now V(s) < 0, too
+        Q[idle] = np.maximum(Q[idle], 0)  # idling is worth 0, even where V(s) < 0 now
         steps.append((policy, V, Q))
         # Easy to get wrong: an action that only ties is not taken, or π may change for ever.
         gain = ~np.isclose(Q[policy, states], Q.max(axis=0), rtol=1e-9, atol=1e-9)  # (S,)
@@ -124,8 +126,8 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     """V (n,) of Equation 3, V = R + γ P V, as a linear system; P (n, n), R (n,)."""
     # (I - γ P) V = R
     A = sparse.eye_array(len(R), format="csc") - discount * P.tocsc()  # (n, n)
-    # For a large system BiCGSTAB, which approaches V step by step, in little memory. If it does not
-    # get there, and for small ones, a direct solver, whose memory may grow with n².
+    # For a large system BiCGSTAB, an iterative solver that needs little memory. For small ones, and
+    # where that does not converge, a direct solver, whose memory may grow with n².
     if len(R) > 1000:
         V, _ = linalg.bicgstab(A, R, rtol=1e-13, maxiter=1000)  # (n,)
         if (np.abs(A @ V - R) <= 1e-10 * np.maximum(1, np.abs(V))).all():
@@ -133,12 +135,12 @@ def solve_system(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndar
     return linalg.spsolve(A, R) if len(R) else R  # (n,); n may be 0
 
 
-def may_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
-    """(n,) bool: the states from which a state of `goal` (n,) bool may be reached by P (n, n)."""
-    may, before = goal, None  # in 0 steps
-    while not np.array_equal(may, before):
-        may, before = may | (P @ may > 0), may  # in one step more
-    return may
+def can_reach(P: sparse.csr_array, goal: np.ndarray) -> np.ndarray:
+    """(n,) bool: the states from which a state of `goal` (n,) bool can be reached by P (n, n)."""
+    reaches, before = goal, None  # in 0 steps
+    while not np.array_equal(reaches, before):
+        reaches, before = reaches | (P @ reaches > 0), reaches  # in one step more
+    return reaches
 
 
 def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
@@ -150,44 +152,44 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
         return np.ones(len(R), bool)
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
-    live = may_reach(P, np.abs(R) > 1e-9)  # from here something may still be collected
-    # An end: a transition that terminates, or a state after which nothing is collected. Where one
-    # may be reached from everywhere, it is, with probability 1: there are finitely many states.
-    ends = may_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
+    live = can_reach(P, np.abs(R) > 1e-9)  # a reward other than 0 can still come
+    # An end is a transition that terminates, or a state after which no reward comes. If one can be
+    # reached from every state, π reaches one with probability 1: there are finitely many states.
+    ends = can_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
         raise SystemExit("error: at discount 1 the policy has no value: it may collect for ever")
     return live
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the actions of expected reward 0 that end, or lead for certain into the largest
-    set of states that the agent need never leave by such actions: to be idle is worth 0."""
-    idle, before = np.ones(R.shape[1], bool), None  # (S,) the set; states are taken out
+    """(A, S) bool: the idle actions. Such an action has expected reward 0, and ends the episode or
+    leads only to states that have an idle action, too: the agent can idle for ever, for 0."""
+    idle, before = np.ones(R.shape[1], bool), None  # (S,) has an idle action; at first all do
     while not np.array_equal(idle, before):
-        # |reward| + the chance to leave the set, by one backup; ∞ where there is no action
+        # |reward| + the probability to leave them, by one backup; ∞ where there is no action
         actions = backup(P, np.abs(R), ~idle, discount=1) <= 1e-9  # (A, S)
         idle, before = actions.any(axis=0), idle
     return actions
 
 
-def first_policy(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
-    """π (S,) int to begin with. At discount 1 it needs a value: from every state it may come to an
-    end, or to states where it stays idle.
+def initial_policy(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarray:
+    """The initial π (S,) int. At discount 1 it must have a value: from every state it can reach an
+    end, or states in which it idles.
 
     Exits if no policy does.
     """
     if discount < 1:
         return np.zeros(R.shape[1], int)  # the first action
     idle = idle_actions(P, R)  # (A, S)
-    policy, done, before = idle.argmax(axis=0), idle.any(axis=0), None  # (S,), (S,)
+    policy, safe, before = idle.argmax(axis=0), idle.any(axis=0), None  # (S,), (S,)
     ends = (P.sum(axis=1) < 1 - 1e-9).reshape(R.shape) & np.isfinite(R)  # (A, S)
-    while not np.array_equal(done, before):
-        # From the end backwards: actions that may end, or lead to a state that is done
-        good = ends | ((P @ done).reshape(R.shape) > 0)  # (A, S)
-        policy = np.where(done, policy, good.argmax(axis=0))  # (S,)
-        done, before = done | good.any(axis=0), done  # (S,)
-    if not done.all():
-        raise SystemExit("error: no policy has a value at discount 1: a state comes to no end")
+    while not np.array_equal(safe, before):
+        # From the end backwards: actions that can end, or lead to a state that is safe
+        good = ends | ((P @ safe).reshape(R.shape) > 0)  # (A, S)
+        policy = np.where(safe, policy, good.argmax(axis=0))  # (S,)
+        safe, before = safe | good.any(axis=0), safe  # (S,)
+    if not safe.all():
+        raise SystemExit("error: no policy has a value at discount 1: a state leads to no end")
     return policy
 
 
@@ -228,7 +230,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # it goes on; else an error
+                    if {False: True, True: False}[terminated]:  # `not`; an error for no bool
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -260,7 +262,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
-    """A row of the lecture's table of Q(s, a) (A, S), worked out from V (S,)."""
+    """A row of the lecture's table of Q(s, a) (A, S), from V (S,), both rounded to 0.01."""
     texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
     pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
     return [f"{worked(t, discount, texts)} = {round(q, 2):.9g}" for t, q in pairs]
@@ -269,7 +271,7 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
+    instead; in states that π never reaches, V is NaN and π is -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -294,7 +296,7 @@ def main(args: Args) -> None:
     """Improve the policy that the flags name until it is the best, and report."""
     model, _, P, R = read_model(args)
     text = args.initial_policy or ("" if args.model or args.env_id else "s0=a2 s1=a1 s2=a1")  # π2
-    policy = read_policy(text, model) if text else first_policy(P, R, args.discount)  # (S,)
+    policy = read_policy(text, model) if text else initial_policy(P, R, args.discount)  # (S,)
     if policy.min() < 0:
         raise SystemExit("error: --initial-policy needs an action in every state")
     steps = policy_iteration(P, R, policy, args.discount, args.max_iterations)

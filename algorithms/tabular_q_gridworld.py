@@ -8,7 +8,7 @@
 """Tabular Q-learning: a robot learns GridWorld without its model (§5.2, Algorithm 5, Eq. 34-37).
 
 It prints and draws Figure 9, the Q-values of each cell, and Figure 10, the policy. Beside them is
-Q* by value iteration (§4.3): the model is known to the judge, never to the learner.
+Q* by value iteration (§4.3): the evaluation uses the model, the learner never does.
 
 Run it
     python algorithms/tabular_q_gridworld.py                       # 1,000 episodes: Figure 9
@@ -24,18 +24,18 @@ Measured, by `python benchmarks/gridworld.py seeds`
     200,000 episodes: Figure 10's policy for 20 of 20 seeds, with max |Q - Q*| from 0.006 to 0.028.
 
 Deviations from the lecture
-    Rewards       ±1 in the marked cells, slip 0.2: the lecture's text has no numbers. It pays only
-                  in those cells; here a step costs 0.025, for Figure 10 is optimal, undiscounted,
-                  exactly for step rewards from -0.0274 to -0.0221:
-                  `python benchmarks/gridworld.py step-rewards` shows it.
-    Convergence   --episodes of them: samples do not tell whether Q has converged.
-    α             0.7 · N(s,a)^-0.85, N(s,a) visits: Q settles with a constant α only without slips.
+    Rewards       ±1 in the marked cells, slip 0.2: the lecture's text has no numbers. In it only
+                  those cells pay. Here a step costs 0.025, since without a discount Figure 10 is
+                  optimal only for step rewards from -0.0274 to -0.0221, as
+                  `python benchmarks/gridworld.py step-rewards` shows.
+    Stopping      after --episodes: from samples one cannot tell whether Q has converged.
+    α             0.7 · N(s,a)^-0.85, N(s,a) visits: with slips, Q converges only if α falls.
     ε             falls with each episode, from 1 to 0.7. A greedier robot hardly ever sees (4,1);
                   and Q-learning learns Q* from any behaviour that keeps trying every action in
                   every state (it is off-policy).
     Discount      --discount, 1 by default as in Equation 34: other environments need one.
     Time limit    1,000 steps, where the environment has none: a policy may never end.
-    Figure 9      its 1000 interactions are 1,000 episodes; 1,000 steps are about 30 episodes.
+    Figure 9      its 1000 interactions are taken as episodes: 1,000 steps are only about 30.
 """
 
 import json
@@ -71,18 +71,18 @@ class Args:
     learning_rate_exponent: float = 0.85
     """ω in [0, 1] of α = learning_rate · N(s,a)^-ω, N(s,a) visits; 0: a constant α"""
     epsilon_initial: float = 1.0
-    """ε_initial in [0, 1], chance of a random action in the first episode (line 1)"""
+    """ε_initial in [0, 1], probability of a random action in the first episode (line 1)"""
     epsilon_final: float = 0.7
     """ε_final in [0, 1], the same in the last episode (line 10)"""
 
     slip_probability: float = 0.2
-    """GridWorld: chance that a move slips, half to each side (0: Figure 3, left)"""
+    """GridWorld: probability that a move slips, half to each side (0: Figure 3, left)"""
     step_reward: float = -0.025
     """GridWorld: reward of every step that does not end the episode"""
     env_id: str = "GridWorld"
     """or a Gymnasium environment with Discrete observations and actions"""
     env_kwargs: str = ""
-    """its arguments, such as "map_name=8x8 is_slippery=False"; all but True and False are text"""
+    """arguments of --env-id, such as "map_name=8x8 is_slippery=False"; not of GridWorld"""
 
     seed: int = 0
     """seed of the environment's and of the exploration's random generators"""
@@ -105,10 +105,10 @@ class GridWorld(gym.Env):
     """The robot's world (Figures 2, 3): cells (x, y), 4 wide and 3 high, a wall in (2,2).
 
     Observation: Discrete(11), an index into `cells`. Action: Discrete(4), an index into `actions`.
-    A move slips to each of its two sides with slip_probability / 2; into the wall or out of bounds
-    it stays. Entering (4,3) pays +1, (4,2) pays -1, and both end the episode; other steps pay
-    step_reward. `reset(options={"cell": (3, 1)})` starts there and not in (1,1).
-    The model is `P`, {s: {a: [(P(s'|s,a), s', R(s,a,s'), terminated), …]}}, as in Gymnasium's own.
+    A move slips to each of its two sides with slip_probability / 2; a move into the wall or out of
+    bounds leaves the robot where it is. Entering (4,3) pays +1, (4,2) -1, and ends the episode; any
+    other step pays step_reward. `reset(options={"cell": (3, 1)})` starts in (3,1), not in (1,1).
+    The model is `P`, {s: {a: [(P(s'|s,a), s', R(s,a,s'), terminated), …]}}, Gymnasium's own format.
     """
 
     start, wall = (1, 1), (2, 2)
@@ -149,7 +149,7 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break  # else the last outcome: the probabilities add up to 1
+                break  # never, by rounding: then the last outcome
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 
@@ -197,7 +197,7 @@ def tabular_q_learning(env: gym.Env, args: Args) -> Iterator[tuple[list, list, f
                 a = int(random() * A)
             else:
                 best = max(Q[s])
-                ties = [a for a in range(A) if Q[s][a] == best]  # at first all: no one goes first
+                ties = [a for a in range(A) if Q[s][a] == best]  # at the start all actions
                 a = ties[int(random() * len(ties))]
             s_next, r, terminated, truncated, _ = env.step(a)
 
@@ -225,7 +225,7 @@ def optimal_action_values(model: dict, discount: float) -> np.ndarray:
     Raises SystemExit if it does not converge, as when reward can be collected for ever.
     """
     Q = np.zeros((len(model), len(model[0])))  # (S, A)
-    for _ in range(10_000):
+    for _ in range(100_000):
         V = Q.max(axis=1)  # (S,)
         for s, choices in model.items():
             for a, outcomes in choices.items():
@@ -235,7 +235,7 @@ def optimal_action_values(model: dict, discount: float) -> np.ndarray:
                     Q[s, a] += probability * (r if terminated else r + discount * V[s_next])
         if np.allclose(Q.max(axis=1), V, rtol=1e-12, atol=1e-12):
             return Q
-    raise SystemExit("error: value iteration does not converge; Q* may be infinite, try --discount")
+    raise SystemExit("error: no Q* after 100,000 sweeps. If it is infinite, lower --discount")
 
 
 def greedy(Q: np.ndarray) -> np.ndarray:
@@ -299,11 +299,11 @@ def draw_action_values(axes: Axes, world: GridWorld, Q: np.ndarray, title: str) 
 
 
 def main() -> None:
-    """Learn, judge by Q* where there is a model, report."""
+    """Learn, compare with Q* where there is a model, report."""
     args = tyro.cli(Args)
     env = make_world(args)
     world = env.unwrapped
-    model = getattr(world, "P", None)  # for the judge; the learner never reads it
+    model = getattr(world, "P", None)  # for the evaluation; the learner never reads it
     if model is not None:
         Q_star = optimal_action_values(model, args.discount)  # (S, A)
     name = f"{args.env_id.replace('/', '-')}__tabular_q_gridworld__{args.seed}"
@@ -350,7 +350,7 @@ def main() -> None:
     figure.savefig(run_dir / "figure.png", dpi=100)
 
     if model is not None:
-        # Every action that is best in Q is best in Q*.
+        # Every action that is best in Q is best in Q*. (At discount 1 a detour for 0 is best, too.)
         optimal = (greedy(Q) <= greedy(Q_star)).all(axis=1)[visited].sum()
         print(f"{label} = {score:.4f}, optimal in {optimal} of {visited.sum()} states visited")
     score = np.mean(returns[-100:])

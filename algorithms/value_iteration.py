@@ -21,11 +21,11 @@ Deviations
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).
     At discount 1, of actions that tie (to 1e-9), the policy takes one that ends: an argmax may walk
     to and fro for ever.
-    At discount 1 V_i may stop above V*. Say that in s0 one action gets 8 and leads to s1, whose
-    only way out costs 9, and another stays in s0 for 0. V_1(s0) = 8, since V_0(s1) = 0. From then
-    on to stay is worth 8, to leave 8 - 9 = -1, and V_i never falls to V* = 0. Or rewards cancel,
-    as -1 from s0 to s1 and 1 back, beside an exit from s0 that costs 5, and V_i swings for ever.
-    Then the script exits with an error; policy_iteration.py solves both.
+    At discount 1 V_i may stop above V*. Say that s1 has one action, which ends and costs 9, and s0
+    has two: "go" to s1, which pays 8, and "stay" in s0, which pays 0. V_0(s1) = 0 makes V_1(s0) 8;
+    "stay" is worth V_i(s0), so V_i(s0) stays at 8 for ever, while V*(s0) = max(8 - 9, 0) = 0.
+    Rewards may also cancel: -1 from s0 to s1 and 1 back, beside an exit from s0 that costs 5, make
+    V_i alternate for ever. Then the script exits with an error; policy_iteration.py solves both.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -78,8 +78,9 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
     "s2": {"a1": [(1.0, "sG", 1, True)], "a2": [(0.7, "sG", 1, True), (0.3, "s0", 0, False)]},
 }
 
-# `arrays`, below, makes two arrays of a model: R (A, S), and P (A·S, S), sparse, whose row a·S + s
-# belongs to action a in state s. Figure 5:
+# The model as arrays (`arrays`, below), for S states with at most A actions each: P (A·S, S) is
+# sparse, its row a·S + s belongs to action a in state s; R (A, S) holds the expected rewards, here
+# written as a column beside P. Figure 5:
 #                P: s0   s1   s2    R: Σ_s' P(s'|s, a) R(s, a, s')
 #     a1, s0         .    1    .    10
 #     a1, s1         .    .    .     1
@@ -88,7 +89,7 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 #     a2, s1         .    .    .    -∞: s1 has no second action; -∞ is never the largest Q
 #     a2, s2        .3    .    .     0.7 = 0.7 · 1 + 0.3 · 0
 # A transition that terminates is left out of P, for nothing comes after it. So a row's sum is the
-# chance to go on, and sG has no row, no column, and V = 0.
+# probability to go on, and sG has no row, no column, and V = 0.
 
 
 # ---- algorithm: value iteration ------------------------------------------------------------------
@@ -111,7 +112,7 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
     """
     V, changes = np.zeros(R.shape[1]), []  # V: (S,)
     for _ in tqdm(range(max_iterations), "value iteration", unit=" sweeps", delay=2, leave=False):
-        # V_i+1(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
+        # V_{i+1}(s) = max_a Σ_s' P(s'|s, a) [R(s, a, s') + γ V_i(s')]  Algorithm 3, line 7
         V, V_old = backup(P, R, V, discount).max(axis=0), V  # (S,)
         changes.append((np.abs(V - V_old) / np.maximum(1, np.abs(V))).max())
         if changes[-1] <= tolerance:
@@ -120,29 +121,29 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """At discount 1: π (S,) int, a best action in each state. Of several, which tie, π takes one
-    that soon leads to an end: of the episode, or of all rewards (states where π can stay for ever
-    and V is 0).
+    """At discount 1: π (S,) int, a best action in each state. Of best actions that tie, π takes the
+    one that ends soonest: the episode ends, or all rewards do (in states with V = 0 where π can
+    stay for ever).
 
-    Exits if the best actions of a state lead to no end.
+    Exits if from some state no best action leads to an end.
     """
-    # Easy to get wrong: where the only reward is at the goal, to walk to and fro and to walk there
-    # tie, and an argmax may walk to and fro for ever.
+    # Easy to get wrong: if the only reward is at the goal, walking to and fro ties with walking to
+    # the goal, and an argmax may choose to walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 that the agent need not leave. At first it has all
-    # of them; then those go from which every best action may lead out of it.
+    # Rest: the largest set of states with V = 0 in which the agent can stay for ever. Start with
+    # all states with V = 0; while every best action of one of them can lead out, drop that state.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): no chance to come elsewhere. An action that ends has none: its row of P is empty.
+        # (A, S): best actions that cannot lead out of rest. One that ends has an empty row in P.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
-    # Which best action ends soonest? A second MDP, which has the best actions alone, tells. It has
-    # a reward of 1 for an end, and any discount below 1 makes a later end worth less:
+    # Which best action ends soonest? The values of a second MDP tell. It has only the best actions,
+    # a reward of 1 for an end, and a discount below 1, so that a later end is worth less:
     # V_end(s) = max_a 0.995 · (1 if a leads to rest, else P(end|s, a) + Σ_s' P(s'|s, a) V_end(s'))
-    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 is not 1
+    ends = (1 - P.sum(axis=1)).round(8).reshape(R.shape)  # (A, S); in floats .7 + .2 + .1 < 1
     R_end, V_end, V_old = np.where(tied, ends, -np.inf), np.zeros(len(V)), None  # (A, S), (S,)
-    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it comes to rest
+    while not np.array_equal(V_end, V_old):  # V_end rises, to 0.995 at most: it converges
         Q_end = 0.995 * np.where(to_rest, 1, backup(P, R_end, V_end, discount=1))  # (A, S)
         V_end, V_old = Q_end.max(axis=0), V_end  # (S,)
     if not V_end.all():
@@ -187,7 +188,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # it goes on; else an error
+                    if {False: True, True: False}[terminated]:  # `not`; an error for no bool
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):
@@ -210,7 +211,7 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[str]:
-    """A row of the lecture's table of Q(s, a) (A, S), worked out from V (S,)."""
+    """A row of the lecture's table of Q(s, a) (A, S), from V (S,), both rounded to 0.01."""
     texts = {s: f"{round(v, 2):.9g}" for s, v in zip(model, V, strict=True)}
     pairs = [(t, Q[a, i]) for i, s in enumerate(model) for a, t in enumerate(model[s].values())]
     return [f"{worked(t, discount, texts)} = {round(q, 2):.9g}" for t, q in pairs]
@@ -219,7 +220,7 @@ def q_row(model: dict, Q: np.ndarray, V: np.ndarray, discount: float) -> list[st
 def report(path: Path | None, model: dict, V, Q, policy, iterations: int, residual: float) -> None:
     """Print V (S,) and π (S,), and write them with Q (A, S) to `path`. The Bellman residual is the
     largest |max_a Q(s, a) - V(s)|. Policy evaluation and exhaustive search have |Q(s, π(s)) - V(s)|
-    instead; where π never comes, V is NaN and π is -1. All have a copy of this function."""
+    instead; in states that π never reaches, V is NaN and π is -1."""
     values, q = (np.where(np.isnan(x), None, x).tolist() for x in (V, Q.T))
     solution = {  # in JSON, undefined is null
         "values": dict(zip(model, values, strict=True)),
@@ -242,16 +243,16 @@ def save_figure(path: Path, env: gym.Env | None, P, V, policy, changes: list[flo
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     axes = figure.add_subplot(1, 2, 1, xlabel="sweep", ylabel="largest relative change of V")
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), marker=".")
-    # The ways of actions 0 to 3 in the plane of complex numbers: 1 is right, 1j is up.
+    # Directions of actions 0 to 3 as complex numbers: 1 is right, 1j is up.
     grids = {"FrozenLakeEnv": [-1, -1j, 1, 1j], "CliffWalkingEnv": [1j, 1, -1j, -1]}
-    if ways := grids.get(type(env).__name__):
-        # P has no transitions that end: the columns of the holes and the goal are empty. So is the
-        # cliff's, from where the agent is put back to the start.
+    if directions := grids.get(type(env).__name__):
+        # P leaves out the transitions that end, so nothing leads to holes and goal: empty columns.
+        # Nothing leads to the cliff either: who steps there is put back to the start.
         acts = P.sum(axis=0) > 0  # (S,)
         cells = np.where(acts, V, np.nan).reshape(-1, getattr(env, "ncol", 12))  # CliffWalking: 12
         axes = figure.add_subplot(1, 2, 2, title="V and π", xticks=[], yticks=[])
         figure.colorbar(axes.imshow(cells, "YlGn", alpha=0.8), label="V(s)", shrink=0.8)
-        arrows = np.where(acts, np.array(ways)[policy], np.nan).reshape(cells.shape)
+        arrows = np.where(acts, np.array(directions)[policy], np.nan).reshape(cells.shape)
         axes.quiver(arrows.real, arrows.imag, pivot="mid")  # up on the page, while rows go down
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png", dpi=120)
@@ -269,8 +270,8 @@ def main(args: Args) -> None:
     policy = Q.argmax(axis=0) if args.discount < 1 else proper_policy(P, R, Q)  # (S,)
     if R.size <= 12:  # small enough to be worked through on paper: V_0, V_1, … once more
         Vs, Q_rows = [np.zeros(len(V))], [["0" for s in model for a in model[s]]]
-        # Numbered as in the lecture's tables: Q_i comes from V_i-1, V_i from Q_i.
-        # Q converges a sweep after V; nine rows are enough.
+        # Numbered as in the lecture's tables: Q_i comes from V_{i-1}, V_i from Q_i, so Q converges
+        # one sweep after V. Rows after i = 9 are not printed.
         for _ in range(min(len(changes) + 1, 9)):
             Q_i = backup(P, R, Vs[-1], args.discount)  # (A, S)
             Q_rows.append(q_row(model, Q_i, Vs[-1], args.discount))

@@ -9,17 +9,17 @@
 
 The lecture names value learning in Table 1 and shows no algorithm. TD(0), temporal-difference
 learning from a single step, is to policy evaluation (Algorithm 1) what Q-learning is to value
-iteration. The sum over s' in Equation 3 becomes the one s' that came, and the assignment a running
-average:
+iteration. The sum over s' in Equation 3 is replaced by one sampled s', and the assignment by a
+running average:
 
     V(s) = (1 - α) V(s) + α (r + γ V(s'))
 
-Beside V as learnt stands V^π from the linear system of Equations 2 and 3: the model is known to the
-judge, never to the learner. The world and its rewards are those of tabular_q_gridworld.py.
+Beside V as learnt stands V^π from the linear system of Equations 2 and 3: the evaluation uses the
+model, the learner never does. World and rewards are those of tabular_q_gridworld.py.
 
 Run it
     python algorithms/value_learning_gridworld.py                       # the policy of Figure 10
-    python algorithms/value_learning_gridworld.py --no-exploring-starts # V where it goes from (1,1)
+    python algorithms/value_learning_gridworld.py --no-exploring-starts # only cells met from (1,1)
     python algorithms/value_learning_gridworld.py --policy \
         "1,1=right 2,1=right 3,1=up 4,1=left 1,2=up 3,2=up 1,3=right 2,3=right 3,3=right"
     tensorboard --logdir runs
@@ -28,8 +28,8 @@ Measured, by the first command
     max |V - V^π| = 0.0206 in the 9 cells visited
 
 Deviations from the lecture
-    Starts        in a random cell, by default: the policy hardly ever gets from (1,1) to (4,1).
-    α             N(s)^-0.7, N(s) visits: V settles with a constant α only without slips.
+    Starts        in a random cell by default: from (1,1) the policy hardly ever reaches (4,1).
+    α             N(s)^-0.7, N(s) visits: with slips, V converges only if α falls.
     Discount      --discount, 1 by default as in Equation 3.
     Time limit    1,000 steps: a policy may never end.
 """
@@ -71,8 +71,8 @@ class Args:
     """start each episode in a random cell; if not, in (1,1)"""
 
     slip_probability: float = 0.2
-    """chance that a move slips, half to each side (0: Figure 3, left; in (3,2) the default policy
-    then walks into the wall for ever, which is refused at discount 1)"""
+    """probability that a move slips, half to each side (0: Figure 3, left; in (3,2) the default
+    policy then walks into the wall for ever, which is refused at discount 1)"""
     step_reward: float = -0.025
     """reward of every step that does not end the episode"""
 
@@ -96,10 +96,10 @@ class GridWorld(gym.Env):
     """The robot's world (Figures 2, 3): cells (x, y), 4 wide and 3 high, a wall in (2,2).
 
     Observation: Discrete(11), an index into `cells`. Action: Discrete(4), an index into `actions`.
-    A move slips to each of its two sides with slip_probability / 2; into the wall or out of bounds
-    it stays. Entering (4,3) pays +1, (4,2) pays -1, and both end the episode; other steps pay
-    step_reward. `reset(options={"cell": (3, 1)})` starts there and not in (1,1).
-    The model is `P`, {s: {a: [(P(s'|s,a), s', R(s,a,s'), terminated), …]}}, as in Gymnasium's own.
+    A move slips to each of its two sides with slip_probability / 2; a move into the wall or out of
+    bounds leaves the robot where it is. Entering (4,3) pays +1, (4,2) -1, and ends the episode; any
+    other step pays step_reward. `reset(options={"cell": (3, 1)})` starts in (3,1), not in (1,1).
+    The model is `P`, {s: {a: [(P(s'|s,a), s', R(s,a,s'), terminated), …]}}, Gymnasium's own format.
     """
 
     start, wall = (1, 1), (2, 2)
@@ -140,13 +140,13 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break  # else the last outcome: the probabilities add up to 1
+                break  # never, by rounding: then the last outcome
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 
 
 def read_gridworld_policy(text: str, world: GridWorld) -> dict[int, int]:
-    """The policy {s: a} in `text`, "1,1=up 2,1=left …". Raises SystemExit if it is none."""
+    """The policy {s: a} in `text`, "1,1=up 2,1=left …". Raises SystemExit if it is not one."""
     cells = [cell for cell in world.cells if cell not in world.terminals]  # nobody acts there
     states = {f"{x},{y}": world.cells.index((x, y)) for x, y in cells}
     policy = dict(item.partition("=")[::2] for item in text.split())  # {cell: action}
@@ -160,17 +160,18 @@ def read_gridworld_policy(text: str, world: GridWorld) -> dict[int, int]:
 
 
 def value_learning(env: gym.Env, policy: dict, args: Args) -> Iterator[tuple[list, list]]:
-    """TD(0) of `policy` {s: a}. Yields V and N (lists, S), as they are, after each episode."""
+    """TD(0) of `policy` {s: a}. Yields after each episode V and N (lists, S), the tables
+    themselves, which the next episode changes."""
     # Easy to get wrong: with one seed for both, the numbers that choose the starts would be the
     # very numbers that make the robot slip. Hence two seeds from one.
     seeds = np.random.SeedSequence(args.seed).generate_state(2)  # (2,) uint32
-    random = np.random.default_rng(seeds[1])
+    rng = np.random.default_rng(seeds[1])
     V = [0.0] * 11  # V(s); where s is terminal it stays 0 (Equation 2)
     N = [0] * 11  # N(s), visits
     cells = [env.unwrapped.cells[s] for s in policy] if args.exploring_starts else [(1, 1)]
     env.reset(seed=int(seeds[0]))
     for _ in range(args.episodes):
-        s, _ = env.reset(options={"cell": cells[random.integers(len(cells))]})
+        s, _ = env.reset(options={"cell": cells[rng.integers(len(cells))]})
         done = False
         while not done:
             s_next, r, terminated, truncated, _ = env.step(policy[s])
@@ -193,7 +194,7 @@ def value_learning(env: gym.Env, policy: dict, args: Args) -> Iterator[tuple[lis
 
 
 def exact_values(world: GridWorld, policy: dict[int, int], discount: float) -> np.ndarray:
-    """V^π (S,) float64 of Equations 2 and 3. Raises SystemExit if it is not finite."""
+    """V^π (S,) float64 of Equations 2 and 3. Raises SystemExit at discount 1 if π may never end."""
     # P(s'|s,π(s)) (S, S) of the steps that do not end the episode, and the expected reward (S,)
     P, R = np.zeros((11, 11)), np.zeros(11)
     for s, a in policy.items():
@@ -246,7 +247,7 @@ def draw_values(axes: Axes, world: GridWorld, V: np.ndarray, policy: dict, title
 
 
 def main() -> None:
-    """Learn V of the policy, judge it by V^π, report."""
+    """Learn V of the policy, compare it with V^π, report."""
     args = tyro.cli(Args)
     world = GridWorld(args.slip_probability, args.step_reward)
     policy = read_gridworld_policy(args.policy, world)

@@ -3,8 +3,9 @@
 
     python benchmarks/replay_memory.py        # 100,000 transitions a game, scaled to a million
     python benchmarks/replay_memory.py --transitions 1000000 --games SpaceInvaders
+    python benchmarks/replay_memory.py --games --checkpoints runs/RUN/checkpoint.pt    # of a run
 
-One process a game. Resident memory is what the operating system counts for the process (RSS),
+One process a game or checkpoint. Resident memory is what the operating system counts (RSS),
 after less before: frames, references, actions, rewards and whatever Python and the allocator add.
 Beside it stand the lecture's figure (§7.3.2), one raw 84×84 frame a transition, and what CleanRL
 (one stack of four frames) and Stable-Baselines3 (two stacks) allocate.
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import torch
 import tyro
 from tqdm import tqdm
 
@@ -32,6 +34,8 @@ class Args:
     """Transitions to store."""
     games: tuple[str, ...] = ("Breakout", "Enduro", "Pong", "Riverraid", "SpaceInvaders")
     """Games to play."""
+    checkpoints: tuple[Path, ...] = ()
+    """Checkpoints of dqn_atari.py, whose replay memories are measured, too."""
     worker: bool = False
     """Used by the benchmark itself: measure one game in this process."""
 
@@ -51,31 +55,42 @@ def play(game: str, capacity: int, transitions: int) -> dqn.ReplayMemory:
     return replay
 
 
-def resident(game: str, transitions: int) -> int:
-    """Bytes of resident memory that `transitions` take."""
-    play(game, 100, 100)  # the emulator's and the libraries' own memory is not the replay's
+def read(checkpoint: Path) -> dqn.ReplayMemory:
+    """The replay memory of a run."""
+    saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["replay"]
+    replay = dqn.ReplayMemory(len(saved["places"]), (4, 84, 84), "cpu")
+    replay.load_state_dict(saved)
+    return replay
+
+
+def resident(args: Args) -> float:
+    """Bytes of resident memory that a transition takes."""
+    play("Pong", 100, 100)  # the emulator's and the libraries' own memory is not the replay's
     gc.collect()
     before = psutil.Process().memory_info().rss
-    kept = play(game, transitions, transitions)
+    if args.checkpoints:
+        kept = read(args.checkpoints[0])
+    else:
+        kept = play(args.games[0], args.transitions, args.transitions)
     gc.collect()
-    after = psutil.Process().memory_info().rss
-    del kept
-    return after - before
+    return (psutil.Process().memory_info().rss - before) / len(kept)
 
 
 def main(args: Args) -> None:
     """Measure each game in a process of its own and print the table."""
     if args.worker:
-        print(json.dumps(resident(args.games[0], args.transitions)))
+        print(json.dumps(resident(args)))
         return
     print(f"{args.transitions:,} transitions a game\n")
     print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
-    for game in args.games:
-        command = [sys.executable, __file__, "--worker", "--games", game]
-        command += ["--transitions", str(args.transitions)]
-        done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
-        each = json.loads(done.stdout.splitlines()[-1]) / args.transitions
-        print(f"{'dqn_atari.py, ' + game:<44}{each / 1e3:>10.2f}{each:>12.0f}", flush=True)
+    jobs = {game: ["--games", game] for game in args.games}
+    jobs |= {path.parent.name.split("__")[0] + ", trained": ["--checkpoints", str(path)]
+             for path in args.checkpoints}
+    for name, flags in jobs.items():
+        command = [sys.executable, __file__, "--worker", "--transitions", str(args.transitions)]
+        done = subprocess.run([*command, *flags], stdout=subprocess.PIPE, check=True, text=True)
+        each = json.loads(done.stdout.splitlines()[-1])
+        print(f"{'dqn_atari.py, ' + name:<44}{each / 1e3:>10.2f}{each:>12.0f}", flush=True)
     others = {
         "one raw frame (Nature, Dopamine)": 84 * 84,
         "the lecture (§7.3.2)": 11_000,

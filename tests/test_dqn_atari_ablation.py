@@ -25,6 +25,8 @@ SHORT = test_dqn_atari.SHORT | dict(
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """Run a script's main in this process: its run directory, every update's arguments."""
+    monkeypatch.setattr(ablation, "max_q_mean", lambda network, states, mean=ablation.max_q_mean: (
+        mean(network, states) if network.head.weight.requires_grad else pytest.fail("of θ⁻")))
 
     def call(script, **flags) -> tuple[Path, list]:
         calls, update = [], script.update
@@ -33,8 +35,7 @@ def run(tmp_path, monkeypatch):
             update(q_network, target_network, *rest))[1])
         runs = tmp_path / f"{script.__name__}{len(list(tmp_path.iterdir()))}"
         script.main(script.Args(**SHORT | flags, runs_dir=str(runs)))
-        (run_dir,) = runs.iterdir()
-        return run_dir, calls
+        return next(runs.iterdir()), calls
 
     return call
 
@@ -111,6 +112,5 @@ def test_held_out_states_are_the_seeds_own():
     assert first.shape == (500, 4, 84, 84) and first.dtype == torch.uint8
     assert torch.equal(first, again) and not torch.equal(first, other)
     q_network = ablation.QNetwork(4, 84, 84, 4)
-    with torch.no_grad():
-        expected = np.mean([max(q_network(state[None])[0].tolist()) for state in first[:20]])
+    expected = np.mean([max(q_network(state[None])[0].tolist()) for state in first[:20]])
     assert ablation.max_q_mean(q_network, first[:20]) == pytest.approx(expected, rel=1e-4)

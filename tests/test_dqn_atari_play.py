@@ -23,7 +23,7 @@ SEED, EPSILON, ACTIONS = 15, 0.8, ["NOOP", "FIRE", "RIGHT", "LEFT"]  # of Breako
 def episode(tmp_path_factory):
     """A game of a network that dqn_atari.py wrote, and its actions on the bare emulator."""
     runs, returned, whole = tmp_path_factory.mktemp("runs"), [], play.play
-    few = {"environment_train_frames_max": 1, "environment_test_frames": 1}
+    few = dict(env_id="ALE/Breakout-v5", environment_train_frames_max=1, environment_test_frames=1)
     dqn.main(dqn.Args(**test_dqn_atari.SHORT | few, runs_dir=str(runs)))
     torch.set_flush_denormal(False)
     (path,) = runs.glob("*/q_network.pt")
@@ -65,7 +65,7 @@ def test_trace_is_the_game(episode):
     assert np.array_equal(trace["value"], q.max(axis=1)) and q.std(axis=0).min() > 1e-4
     random = trace["choice"] == "random"
     assert np.array_equal(trace["action"][~random], np.take(ACTIONS, q.argmax(axis=1))[~random])
-    assert abs(random.mean() - EPSILON) < 4 * np.sqrt(EPSILON * (1 - EPSILON) / n)
+    assert abs(random.mean() - EPSILON) < 0.12 and {*trace["action"][random]} == {*ACTIONS}
 
 
 def test_files_are_whole_and_the_video_is_the_game(episode):
@@ -128,7 +128,7 @@ def test_published_agents_play_and_games_have_mean_and_variance(game, modest, ca
     assert min(scores) >= modest and sorted(folder.rglob("*")) == before
     out = capsys.readouterr().out
     for a, b in (scores, [len(rows) for rows, _, _ in played]):
-        assert f"mean {(a + b) / 2:.5g}, variance {(a - b) ** 2 / 2:.5g}\n" in out
+        assert f"mean {(a + b) / 2:,.2f}, variance {(a - b) ** 2 / 2:,.1f}\n" in out
 
 
 def test_the_newest_run_is_found_else_the_published_one(tmp_path, monkeypatch):

@@ -63,11 +63,12 @@ def test_random_models_against_every_policy(solver, discount, tmp_path):
         found, best = run(solver, tmp_path, model, discount=discount), brute(model, discount)
         V, policy = found["values"], {s: next(iter(model[s])) for s in model} | found["policy"]
         seen = 1 if solver is SCRIPTS[1] else len(model)  # exhaustive search: the start alone
+        atol = 1e-6 if "-1000000000.0" in str(model) else 1e-8  # beside a fine of 1e9
         for values in (list(V.values()), dense(model, policy, discount)):
-            np.testing.assert_allclose(values[:seen], best[:seen], rtol=1e-8, atol=1e-6)
+            np.testing.assert_allclose(values[:seen], best[:seen], 1e-8, atol)
         for s, a in found["policy"].items():
             Q = sum(p * (r + discount * (0 if end else V[n])) for p, n, r, end in model[s][a] if p)
-            assert found["action_values"][s][a] == pytest.approx(Q, rel=1e-8, abs=1e-6)
+            assert found["action_values"][s][a] == pytest.approx(Q, rel=1e-8, abs=atol)
         assert found["residual"] <= 1e-8 * max(1, abs(best).max())
 
 
