@@ -81,10 +81,10 @@ def main(args: Args) -> None:
     if args.worker:
         print(json.dumps(resident(args)))
         return
-    print(f"{args.transitions:,} transitions a game\n")
+    print(f"{args.transitions:,} transitions a game, or those of a checkpoint\n")
     print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
     jobs = {game: ["--games", game] for game in args.games}
-    jobs |= {path.parent.name.split("__")[0] + ", trained": ["--checkpoints", str(path)]
+    jobs |= {path.parent.name.split("NoFrameskip")[0] + ", trained": ["--checkpoints", str(path)]
              for path in args.checkpoints}
     for name, flags in jobs.items():
         command = [sys.executable, __file__, "--worker", "--transitions", str(args.transitions)]
