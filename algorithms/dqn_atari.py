@@ -37,8 +37,8 @@ Deviations
     squared error (Algorithm 6, line 22)  Huber loss                          §5.3
     [8]: acts at random before learning   ε falls from the first frame        Algorithm 6
     [8]'s code: all weights uniform       orthogonal convolution filters      §7.5.1, Table 4
-    [8]'s code: empty frames before x₀    copies of x₀                        x₀ is a screen
-    [8]'s code: all minimal actions       those of FIRE and four directions   §7.3.3
+    [8]'s code: empty frames before x₀    copies of x₀                        no screen is empty
+    [8]'s code: all minimal actions       of them NOOP, FIRE, 4 directions    §7.3.3
     [8] tests the best evaluation's θ     the last θ                          no choice by score
     [8]'s code: screens averaged by area  bilinear, without antialiasing      §7.2.1 says bilinear
     Algorithm 6: reset after a lost life  the game goes on, without the       later lives are
@@ -530,8 +530,8 @@ def dead_units(q_network: QNetwork, states: torch.Tensor) -> float:
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
     """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
     frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
-    the final test, does not. Seed and number alone decide all that is random. Returns a list,
-    (score, length in frames) of every game that has ended, and both so far of the one cut off."""
+    the final test, does not. Seed and number alone decide all that is random. Returns [(score,
+    length in frames), …] of the games that ended, and [score, length] so far of the one cut off."""
     games = args.environment_evaluation_episodes if number else math.inf
     # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
     # [seed, number + 1].
@@ -781,8 +781,8 @@ def main(args: Args) -> None:
         bar.update()
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
-            # SPS: frames a second, evaluations and files included. td_loss: the mean Huber loss of
-            # the last minibatch; q_values: the mean of its Q(s_j, a_j).
+            # SPS: frames a second; evaluations count, writing checkpoints does not. td_loss: the
+            # last minibatch's mean Huber loss; q_values: the mean of its Q(s_j, a_j).
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
             # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)

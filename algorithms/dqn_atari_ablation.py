@@ -549,8 +549,8 @@ def max_q_mean(q_network: QNetwork, states: torch.Tensor) -> float:
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
     """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
     frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
-    the final test, does not. Seed and number alone decide all that is random. Returns a list,
-    (score, length in frames) of every game that has ended, and both so far of the one cut off."""
+    the final test, does not. Seed and number alone decide all that is random. Returns [(score,
+    length in frames), …] of the games that ended, and [score, length] so far of the one cut off."""
     games = args.environment_evaluation_episodes if number else math.inf
     # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
     # [seed, number + 1].
@@ -810,8 +810,8 @@ def main(args: Args) -> None:
         bar.update()
         counters.seconds = time.monotonic() - started
         if counters.frames % REPORT_INTERVAL == 0:
-            # SPS: frames a second, evaluations and files included. td_loss: the mean Huber loss of
-            # the last minibatch; q_values: the mean of its Q(s_j, a_j).
+            # SPS: frames a second; evaluations count, writing checkpoints does not. td_loss: the
+            # last minibatch's mean Huber loss; q_values: the mean of its Q(s_j, a_j).
             speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
             # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)

@@ -473,8 +473,8 @@ def passed(count: int, step: int, interval: int) -> int:
 def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> tuple:
     """Play whole games at ε_evaluation, for raw reward, in at most `environment_test_frames`
     frames. Evaluations number 1, 2, … stop after `environment_evaluation_episodes` games; number 0,
-    the final test, does not. Seed and number alone decide all that is random. Returns a list,
-    (score, length in frames) of every game that has ended, and both so far of the one cut off."""
+    the final test, does not. Seed and number alone decide all that is random. Returns [(score,
+    length in frames), …] of the games that ended, and [score, length] so far of the one cut off."""
     games = args.environment_evaluation_episodes if number else math.inf
     # main's generators are made from [seed, 0, …], the test's from [seed, 1], an evaluation's from
     # [seed, number + 1].

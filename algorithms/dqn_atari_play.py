@@ -14,7 +14,7 @@ Run it
     python algorithms/dqn_atari_play.py                    # the newest run under runs/
     python algorithms/dqn_atari_play.py --game pong --games 30   # mean and variance, no pictures
 
-In the folder play-seed1 beside q_network.pt, or in --output, an earlier game's files are replaced:
+Written to the folder play-seed1 beside q_network.pt, or to --output, over an earlier game's files:
     episode.webm   the game, 15 frames a second, with Q of every action and the value beside it
     play.gif       its first twelve seconds; 0.4 to 0.7 MB, by game
     values.png     Figure 20: value, Q of every action and best action against the frame
@@ -313,7 +313,7 @@ def draw_curves(rows: list[dict], q: np.ndarray, moments: list[int], trained) ->
     """Figure 20: value, Q of every action and best action, with scores and lost lives."""
     value, best = q.max(axis=1), q.argmax(axis=1)  # (T,) each
     rewards = np.array([row["reward"] for row in rows])  # (T,)
-    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # frame after the loss
+    lost = 1 + np.flatnonzero(np.diff([row["lives"] for row in rows]) < 0)  # by this frame's action
 
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(f"{trained.env_id}: score {rewards.sum():g}")

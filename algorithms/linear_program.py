@@ -77,7 +77,7 @@ FIGURE_5 = {  # model[state][action] = [(probability, next state, reward, termin
 
 
 def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
-    """Equation 27 as a linear program: V* (S,), and the solver's iterations. Exits without a V*.
+    """Equation 27 as a linear program: V* (S,), and the solver's iterations. Exits if it has none.
 
     V(s) ≥ the sum in Equation 27 for each action a means V(s) ≥ their maximum. V* is the smallest
     such V: if V(s) were above the maximum in some state, V(s) could be lowered.
@@ -86,7 +86,7 @@ def linear_program(P, R, discount: float) -> tuple[np.ndarray, int]:
     # that is (γ P - E) V ≤ -R, where E has a 1 in each row's own state
     exists = np.isfinite(R.ravel())  # (A·S,)
     E = sparse.vstack([sparse.eye_array(R.shape[1])] * len(R))  # (A·S, S)
-    A, b = (discount * P - E).tocsr()[exists], -R.ravel()[exists]  # a row, a number an action
+    A, b = (discount * P - E).tocsr()[exists], -R.ravel()[exists]  # a row for each s and a
     # The solver's default tolerance, 1e-7, cannot tell close actions apart; 1e-10 can. A float64
     # has 16 digits, though: beside a reward of 1e9 no solver reaches 1e-10, so ask for less there.
     tolerance = float(np.clip(1e-16 * np.abs(b).max(), 1e-10, 1e-7))
@@ -112,8 +112,8 @@ def backup(P: sparse.csr_array, R: np.ndarray, V: np.ndarray, discount: float) -
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """At discount 1: π (S,) int, a best action in each state. Of best actions that tie, π takes the
-    one that ends soonest: the episode ends, or all rewards do (in states with V = 0 where π can
-    stay for ever).
+    one that ends soonest (see below): the episode ends, or all rewards do (in states with V = 0
+    where π can stay for ever).
 
     Exits if from some state no best action leads to an end.
     """
@@ -121,11 +121,11 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # the goal, and an argmax may choose to walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 in which the agent can stay for ever. Start with
-    # all states with V = 0; while every best action of one of them can lead out, drop that state.
+    # Rest: the largest set of states with V = 0 that best actions need not leave but by an end. At
+    # first all states with V = 0; while every best action of one can lead out, drop that one.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): best actions that cannot lead out of rest. One that ends has an empty row in P.
+        # (A, S): best actions that only lead to rest or end. One that surely ends has an empty row.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
     # Which best action ends soonest? The values of a second MDP tell. It has only the best actions,
@@ -142,8 +142,8 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the idle actions. Such an action has expected reward 0, and ends the episode or
-    leads only to states that have an idle action, too: the agent can idle for ever, for 0."""
+    """(A, S) bool: the idle actions, the largest set of them. Each has expected reward 0 and leads,
+    unless it ends the episode, to states that have one: the agent can idle for ever, for 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) has an idle action; at first all do
     while not np.array_equal(idle, before):
         # |reward| + the probability to leave them, by one backup; ∞ where there is no action

@@ -158,7 +158,7 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
     live = can_reach(P, np.abs(R) > 1e-9)  # a reward other than 0 can still come
-    # An end is a transition that terminates, or a state after which no reward comes. If one can be
+    # An end is a transition that terminates, or a state from which no reward comes. If one can be
     # reached from every state, π reaches one with probability 1: there are finitely many states.
     ends = can_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():

@@ -17,9 +17,9 @@ Measured
     the lecture, the tables repeat the last. The arithmetic of V_i(s) is that of Q_i(s, π_i(s)).
 
 Deviations
-    An action is changed only for a gain of more than 1e-9 · (1 + |V(s)|): of actions that tie, an
-    argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed as the Bellman
-    residual.
+    An action is changed only for a gain of more than 1e-9 · (1 + |max_a Q(s, a)|): of actions that
+    tie, an argmax may change for ever. The gain left, max_a Q(s, a) - V(s), is printed as the
+    Bellman residual.
     At discount 1, Q(s, a) is raised to 0 for an action a with which the agent can idle for ever. If
     V(s) = -9 and a stays in s for 0, Equation 29 gives Q(s, a) = 0 + V(s) = -9, a tie with V(s),
     but idling is worth 0. Then a table prints 1·[0 + -9] = 0.
@@ -153,7 +153,7 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
     # Easy to get wrong: of a state that goes to itself for ever, Equation 3 says V = V + R. It has
     # no solution where R is not 0, and where R is 0 any V solves it: I - P is singular.
     live = can_reach(P, np.abs(R) > 1e-9)  # a reward other than 0 can still come
-    # An end is a transition that terminates, or a state after which no reward comes. If one can be
+    # An end is a transition that terminates, or a state from which no reward comes. If one can be
     # reached from every state, π reaches one with probability 1: there are finitely many states.
     ends = can_reach(P, (P.sum(axis=1) < 1 - 1e-9) | ~live)
     if not ends.all():
@@ -162,8 +162,8 @@ def live_states(P: sparse.csr_array, R: np.ndarray, discount: float) -> np.ndarr
 
 
 def idle_actions(P: sparse.csr_array, R: np.ndarray) -> np.ndarray:
-    """(A, S) bool: the idle actions. Such an action has expected reward 0, and ends the episode or
-    leads only to states that have an idle action, too: the agent can idle for ever, for 0."""
+    """(A, S) bool: the idle actions, the largest set of them. Each has expected reward 0 and leads,
+    unless it ends the episode, to states that have one: the agent can idle for ever, for 0."""
     idle, before = np.ones(R.shape[1], bool), None  # (S,) has an idle action; at first all do
     while not np.array_equal(idle, before):
         # |reward| + the probability to leave them, by one backup; ∞ where there is no action

@@ -149,7 +149,7 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break  # never, by rounding: then the last outcome
+                break  # if it never does, by rounding: the last outcome
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 
@@ -225,7 +225,7 @@ def optimal_action_values(model: dict, discount: float) -> np.ndarray:
     Raises SystemExit if it does not converge, as when reward can be collected for ever.
     """
     Q = np.zeros((len(model), len(model[0])))  # (S, A)
-    for _ in range(100_000):
+    for _ in tqdm(range(100_000), "value iteration", unit=" sweeps", delay=2, leave=False):
         V = Q.max(axis=1)  # (S,)
         for s, choices in model.items():
             for a, outcomes in choices.items():
@@ -350,7 +350,7 @@ def main() -> None:
     figure.savefig(run_dir / "figure.png", dpi=100)
 
     if model is not None:
-        # Every action that is best in Q is best in Q*. (At discount 1 a detour for 0 is best, too.)
+        # Every action best in Q is best in Q*. (At discount 1 so is a detour that costs nothing.)
         optimal = (greedy(Q) <= greedy(Q_star)).all(axis=1)[visited].sum()
         print(f"{label} = {score:.4f}, optimal in {optimal} of {visited.sum()} states visited")
     score = np.mean(returns[-100:])

@@ -25,7 +25,7 @@ Deviations
     has two: "go" to s1, which pays 8, and "stay" in s0, which pays 0. V_0(s1) = 0 makes V_1(s0) 8;
     "stay" is worth V_i(s0), so V_i(s0) stays at 8 for ever, while V*(s0) = max(8 - 9, 0) = 0.
     Rewards may also cancel: -1 from s0 to s1 and 1 back, beside an exit from s0 that costs 5, make
-    V_i alternate for ever. Then the script exits with an error; policy_iteration.py solves both.
+    V_i alternate for ever. In both cases this exits with an error; policy_iteration.py solves both.
     A transition that terminates adds no V(s'). A model may list terminal states, as FrozenLake does
     its goal; their V is never read.
 """
@@ -122,8 +122,8 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """At discount 1: π (S,) int, a best action in each state. Of best actions that tie, π takes the
-    one that ends soonest: the episode ends, or all rewards do (in states with V = 0 where π can
-    stay for ever).
+    one that ends soonest (see below): the episode ends, or all rewards do (in states with V = 0
+    where π can stay for ever).
 
     Exits if from some state no best action leads to an end.
     """
@@ -131,11 +131,11 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # the goal, and an argmax may choose to walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 in which the agent can stay for ever. Start with
-    # all states with V = 0; while every best action of one of them can lead out, drop that state.
+    # Rest: the largest set of states with V = 0 that best actions need not leave but by an end. At
+    # first all states with V = 0; while every best action of one can lead out, drop that one.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
-        # (A, S): best actions that cannot lead out of rest. One that ends has an empty row in P.
+        # (A, S): best actions that only lead to rest or end. One that surely ends has an empty row.
         to_rest = tied & ((P @ ~rest).reshape(R.shape) == 0)
         rest, before = rest & to_rest.any(axis=0), rest
     # Which best action ends soonest? The values of a second MDP tell. It has only the best actions,

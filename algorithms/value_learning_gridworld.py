@@ -140,7 +140,7 @@ class GridWorld(gym.Env):
         for outcome in self.P[self.state][action]:
             draw -= outcome[0]
             if draw < 0:
-                break  # never, by rounding: then the last outcome
+                break  # if it never does, by rounding: the last outcome
         _, self.state, reward, terminated = outcome
         return self.state, reward, terminated, False, {}
 

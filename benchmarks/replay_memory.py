@@ -77,16 +77,16 @@ def resident(args: Args) -> float:
 
 
 def main(args: Args) -> None:
-    """Measure each game in a process of its own and print the table."""
+    """Measure each game or checkpoint in a process of its own and print the table."""
     if args.worker:
         print(json.dumps(resident(args)))
         return
     print(f"{args.transitions:,} transitions a game, or those of a checkpoint\n")
     print(f"{'GB for a million transitions':<44}{'resident':>10}{'bytes each':>12}")
-    jobs = {game: ["--games", game] for game in args.games}
-    jobs |= {path.parent.name.split("NoFrameskip")[0] + ", trained": ["--checkpoints", str(path)]
-             for path in args.checkpoints}
-    for name, flags in jobs.items():
+    jobs = [(game, ["--games", game]) for game in args.games]
+    jobs += [(path.parent.name.split("NoFrameskip")[0] + ", trained", ["--checkpoints", str(path)])
+             for path in args.checkpoints]
+    for name, flags in jobs:
         command = [sys.executable, __file__, "--worker", "--transitions", str(args.transitions)]
         done = subprocess.run([*command, *flags], stdout=subprocess.PIPE, check=True, text=True)
         each = json.loads(done.stdout.splitlines()[-1])

@@ -35,7 +35,7 @@ def run(tmp_path, monkeypatch):
             update(q_network, target_network, *rest))[1])
         runs = tmp_path / f"{script.__name__}{len(list(tmp_path.iterdir()))}"
         script.main(script.Args(**SHORT | flags, runs_dir=str(runs)))
-        return next(runs.iterdir()), calls
+        return *runs.iterdir(), calls  # one run directory
 
     return call
 

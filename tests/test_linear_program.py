@@ -15,9 +15,10 @@ V(s2) ≥ 0.7·[1 + 0] + 0.3·[0 + V(s0)]
 
 
 def test_the_lectures_mdp(tmp_path, capsys):
-    result = run(script, tmp_path)
-    assert capsys.readouterr().out.startswith(PROGRAM)
-    assert result["values"] == pytest.approx({"s0": 11, "s1": 1, "s2": 4})
+    assert run(script, tmp_path)["values"] == pytest.approx({"s0": 11, "s1": 1, "s2": 4})
+    assert capsys.readouterr().out.startswith(PROGRAM + "\n")  # here nothing idles
+    assert run(script, tmp_path, {"s": {"": [go("s")]}})["values"] == {"s": 0}
+    assert "V(s) ≥ 0\n" in capsys.readouterr().out
 
 
 def test_actions_that_differ_little_are_told_apart():
