@@ -13,9 +13,10 @@ as there are simulators. All are on the CPU and warm up for 5,000 frames without
 with: until a run has freed a large block of memory, the C library of Linux gives an update's memory
 back to the system after each, and page faults are timed that a run of hours hardly has.
 
-A run of hours slows down where a benchmark of seconds does not, so an optimizer is also timed
-when it is old: moments of half of the linear layer's units denormal, with and without the flag that
-flushes them. Runs keep the frames per second of their first and last tenth in test.json.
+A run of hours can slow down where a benchmark of seconds does not, so a run is also timed whose
+optimizer is old: half of the linear layer's units dead, and their moments denormal numbers; and
+Adam's step alone, with and without the flag that flushes them. Runs keep the frames per second of
+their first and last tenth in test.json.
 """
 
 import atexit
@@ -90,10 +91,30 @@ def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
             agent_epsilon_greedy_annealing=FILLED, **flags))
 
 
-def ours(args: Args, turns: Turns, **flags) -> None:
-    """dqn_atari.py."""
+def make_old(optimizer: torch.optim.Optimizer, linear: torch.nn.Linear) -> None:
+    """As after a run of hours: half of the units of `linear` dead, their moments denormal."""
+    for group in optimizer.param_groups:
+        for θ in group["params"]:
+            θ.grad = torch.zeros_like(θ)
+    optimizer.step()  # makes the moments
+    linear.bias.data[::2] = -1e4  # such a unit is 0 in every state, and gets no gradient
+    for moments in ("exp_avg", "exp_avg_sq"):
+        optimizer.state[linear.weight][moments][::2] = 1e-39
+
+
+def ours(args: Args, turns: Turns, old: bool = False, **flags) -> None:
+    """dqn_atari.py; `old`: with an old optimizer."""
     import dqn_atari
 
+    make_optimizer = dqn_atari.make_optimizer
+
+    def make_old_optimizer(script_args, q_network):
+        optimizer = make_optimizer(script_args, q_network)
+        make_old(optimizer, q_network.layers[7])
+        return optimizer
+
+    if old:
+        dqn_atari.make_optimizer = make_old_optimizer
     run_script(dqn_atari, args, turns, **flags)
 
 
@@ -238,24 +259,13 @@ def parts(args: Args) -> dict[str, float]:
 
 
 def old_adam_step(flush: bool) -> float:
-    """Milliseconds of Adam's step where half of the linear layer's units are dead, and their
-    moments denormal numbers; `flush`: whether these count as 0."""
+    """Milliseconds of the step of an old Adam; `flush`: whether denormal numbers count as 0."""
     import dqn_atari as dqn
 
     torch.set_flush_denormal(flush)
     q_network = dqn.QNetwork(4, 84, 84, num_actions=6)
     optimizer = dqn.make_optimizer(dqn.Args(), q_network)
-    for θ in q_network.parameters():
-        θ.grad = torch.ones_like(θ)
-    optimizer.step()
-    θ = q_network.layers[7].weight  # (512, 3136): a unit is a row
-
-    def grow_old() -> None:
-        θ.grad[::2] = 0
-        optimizer.state[θ]["exp_avg"][::2] = 1e-40
-        optimizer.state[θ]["exp_avg_sq"][::2] = 1e-40
-
-    return milliseconds(optimizer.step, 100, grow_old)
+    return milliseconds(optimizer.step, 100, lambda: make_old(optimizer, q_network.layers[7]))
 
 
 def in_a_process(call, *args):
@@ -289,6 +299,7 @@ def compare_replay_ratios(args: Args) -> None:
         columns.append(side_by_side(args, {
             "Stable-Baselines3": (stable_baselines3, same),
             "dqn_atari.py, float32": (ours, same | {"precision": "float32"}),
+            "dqn_atari.py, float32, old": (ours, same | {"precision": "float32", "old": True}),
             "dqn_atari.py, auto": (ours, same | {"precision": "auto"}),
         }))
     title = ("update every frame", "update every 4th")
