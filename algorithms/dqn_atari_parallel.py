@@ -492,7 +492,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
         if len(finished) == games:
             break
     # RecordEpisodeStatistics has counted the score and the length of the game that is cut off.
-    return finished, [*map(env.get_wrapper_attr, ("episode_returns", "episode_lengths"))]
+    return finished, [env.get_wrapper_attr(name) for name in ("episode_returns", "episode_lengths")]
 
 
 # ---- report and checkpoint -----------------------------------------------------------------------

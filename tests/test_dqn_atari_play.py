@@ -118,7 +118,7 @@ def test_largest_jumps_against_every_choice(seed):
 
 
 @pytest.mark.parametrize("game, modest", [("pong", 5), ("breakout", 10), ("space_invaders", 350),
-                                          ("enduro", 99), ("riverraid", 1800)])
+                                          ("enduro", 99), ("riverraid", 1800), ("pong_84x84", 5)])
 def test_published_agents_play_and_games_have_mean_and_variance(game, modest, capsys, monkeypatch):
     folder = PONG.parent / game
     played, whole, before = [], play.play, sorted(folder.rglob("*"))
