@@ -749,8 +749,8 @@ def main(args: Args) -> None:
         write_file(run_dir / "checkpoint.pt", lambda path: torch.save(content, path))
 
     bar = tqdm(total=args.environment_train_frames_max, initial=counters.frames, mininterval=1)
-    started = time.monotonic() - counters.seconds
-    checkpoint_time = window_time = time.monotonic()
+    started = time.perf_counter() - counters.seconds
+    checkpoint_time = window_time = time.perf_counter()
     window_frames = counters.frames
     stop = []  # signals so far: with one, the loop ends after the frame, or the evaluation
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -809,11 +809,11 @@ def main(args: Args) -> None:
             save_q_network()
 
         bar.update()
-        counters.seconds = time.monotonic() - started
+        counters.seconds = time.perf_counter() - started
         if counters.frames % REPORT_INTERVAL == 0:
             # SPS: frames a second; evaluations count, writing checkpoints does not. td_loss: the
             # last minibatch's mean Huber loss; q_values: the mean of its Q(s_j, a_j).
-            speed = (counters.frames - window_frames) / (time.monotonic() - window_time)
+            speed = (counters.frames - window_frames) / (time.perf_counter() - window_time)
             # A generator of its own: what is logged changes nothing that is learnt.
             some = np.random.default_rng(counters.frames).integers(len(replay), size=512)
             scalars = {"charts/SPS": speed, "charts/epsilon": epsilon,
@@ -823,10 +823,10 @@ def main(args: Args) -> None:
                 writer.add_scalar(name, value, counters.frames)
             if learning:
                 counters.speeds.append(speed)
-            if time.monotonic() - checkpoint_time > 60 * args.checkpoint_interval_minutes:
+            if time.perf_counter() - checkpoint_time > 60 * args.checkpoint_interval_minutes:
                 save_checkpoint()
-                checkpoint_time = time.monotonic()
-            window_time, window_frames = time.monotonic(), counters.frames
+                checkpoint_time = time.perf_counter()
+            window_time, window_frames = time.perf_counter(), counters.frames
 
     # 32  return θ
     bar.close()

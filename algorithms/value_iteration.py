@@ -122,8 +122,7 @@ def value_iteration(P, R, discount: float, tolerance=1e-12, max_iterations=100_0
 
 def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """At discount 1: π (S,) int, a best action in each state. Of best actions that tie, π takes the
-    one that ends soonest (see below): the episode ends, or all rewards do (in states with V = 0
-    where π can stay for ever).
+    one that soonest ends the episode, or leads to states with V = 0 where π can stay for ever.
 
     Exits if from some state no best action leads to an end.
     """
@@ -131,8 +130,8 @@ def proper_policy(P: sparse.csr_array, R: np.ndarray, Q: np.ndarray) -> np.ndarr
     # the goal, and an argmax may choose to walk to and fro for ever.
     V = Q.max(axis=0)  # (S,)
     tied = np.isclose(Q, V, rtol=1e-9, atol=1e-9)  # (A, S) the best actions
-    # Rest: the largest set of states with V = 0 that best actions need not leave but by an end. At
-    # first all states with V = 0; while every best action of one can lead out, drop that one.
+    # Rest: the states with V = 0 among which best actions can stay for ever, or end. At first all
+    # states with V = 0; while every best action of one can lead out, drop that one.
     rest, before = np.abs(V) <= 1e-9, None  # (S,)
     while not np.array_equal(rest, before):
         # (A, S): best actions that only lead to rest or end. One that surely ends has an empty row.
@@ -188,7 +187,7 @@ def arrays(model: dict) -> tuple[sparse.csr_array, np.ndarray]:
             try:
                 R[a, s] = sum(p * reward for p, _, reward, _ in transitions)
                 for p, next_state, _, terminated in transitions:
-                    if {False: True, True: False}[terminated]:  # not terminated; no bool: an error
+                    if {False: True, True: False}[terminated]:  # not terminated; a text: an error
                         P[a * S + s, number[str(next_state)]] += p
                 p = [transition[0] for transition in transitions]
                 if not (min(p) >= 0 and abs(sum(p) - 1) <= 1e-9 and np.isfinite(R[a, s])):

@@ -8,10 +8,11 @@ The same game, minibatch of 32, replay ratio, learning rate and interval of targ
 0.01, timed once learning is under way, on an otherwise idle machine. The contenders run in
 processes of their own that take turns, 384 frames each while the others wait: all see the same
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
-Stable-Baselines3's DQN with its CnnPolicy and its own Atari wrappers, with as many environments
-as there are simulators. All are on the CPU and warm up for 5,000 frames without learning and 1,144
-with: until a run has freed a large block of memory, the C library of Linux gives an update's memory
-back to the system after each, and page faults are timed that a run of hours hardly has.
+Stable-Baselines3's DQN (float32) with its CnnPolicy and its own Atari wrappers, with as many
+environments as there are simulators. All are on the CPU and warm up for 5,000 frames without
+learning and 1,144 with: until a run has freed a large block of memory, the C library of Linux gives
+an update's memory back to the system after each, and page faults are timed that a run of hours
+hardly has.
 
 A run of hours can slow down where a benchmark of seconds does not, so a run is also timed whose
 optimizer is old: half of the linear layer's units dead, and their moments denormal numbers; and
@@ -88,6 +89,7 @@ def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
             env_id=args.env_id, device="cpu", runs_dir=folder, agent_replay_buffer_initial=FILLED,
             environment_train_frames_max=WARM_UP + args.frames, environment_test_frames=1,
             environment_evaluation_interval_episodes=10**9,  # an evaluation has a bar of its own
+            checkpoint_interval_minutes=1e9,
             agent_epsilon_greedy_annealing=FILLED, **flags))
 
 
@@ -99,7 +101,7 @@ def make_old(optimizer: torch.optim.Optimizer, linear: torch.nn.Linear) -> None:
     optimizer.step()  # makes the moments
     linear.bias.data[::2] = -1e4  # such a unit is 0 in every state, and gets no gradient
     for moments in ("exp_avg", "exp_avg_sq"):
-        optimizer.state[linear.weight][moments][::2] = 1e-39
+        optimizer.state[linear.weight][moments].view(torch.int32)[::2] = 700_000  # is 1e-39
 
 
 def ours(args: Args, turns: Turns, old: bool = False, **flags) -> None:
@@ -293,14 +295,14 @@ def choose_precision() -> str:
 
 def compare_replay_ratios(args: Args) -> None:
     """Stable-Baselines3 and dqn_atari.py, at one update a frame and at one in four."""
-    columns = []
+    columns, precision = [], in_a_process(choose_precision)
     for frequency in (1, 4):
         same = {"agent_update_frequency": frequency}
         columns.append(side_by_side(args, {
             "Stable-Baselines3": (stable_baselines3, same),
             "dqn_atari.py, float32": (ours, same | {"precision": "float32"}),
             "dqn_atari.py, float32, old": (ours, same | {"precision": "float32", "old": True}),
-            "dqn_atari.py, auto": (ours, same | {"precision": "auto"}),
+            f"dqn_atari.py, auto: {precision}": (ours, same | {"precision": precision}),
         }))
     title = ("update every frame", "update every 4th")
     print(f"\n{'frames a second':<38}{title[0]:>22}{title[1]:>22}")
@@ -325,7 +327,7 @@ def compare_simulators(args: Args, times: dict[str, float]) -> None:
     contenders["dqn_atari_parallel.py, 2 ranks of 4"] = (ours_parallel, flags)
     found = side_by_side(args, contenders)
     title = "update every 4th frame"
-    print(f"\n{'frames a second, ' + precision:<38}{title:>28}")
+    print(f"\n{'frames a second, ours in ' + precision:<38}{title:>28}")
     for name in contenders:
         print(f"{name:<38}{found[name]:>19.1f} ({found[name] / found['dqn_atari.py']:.2f})")
     emulation = times["emulate (the bare emulator)"] + times["preprocess, compress, store"]

@@ -44,28 +44,33 @@ class Args:
     solves: tuple[str, ...] = ("value_iteration", "policy_iteration", "policy_evaluation")
     """what is solved; modified_policy_iteration, too, can be"""
     limit: float = 170.0
-    """seconds after which a solve is given up, imports and the making of the model included"""
+    """seconds until a solve, or all sweeps, are given up, imports and making the model included"""
 
 
-def our_mdp(size: int) -> tuple[sparse.csr_array, np.ndarray]:
-    """P (A·S, S) and R (A, S), the same every time."""
-    rng, rows = np.random.default_rng(0), size * ACTIONS
-    p = rng.random((rows, SUCCESSORS))
-    p /= p.sum(axis=1, keepdims=True)
-    s_next = rng.integers(0, size, rows * SUCCESSORS, dtype=np.int32)
+def random_mdp(size: int, by_state: bool = False) -> tuple[sparse.csr_array, np.ndarray]:
+    """P (A·S, S) and R (A, S), the same every time; `by_state`: with the actions of a state side by
+    side, P (S·A, S) and R (S, A)."""
+    rng, order = np.random.default_rng(0), (size, ACTIONS) if by_state else (ACTIONS, size)
+    p, s_next = np.empty((*order, SUCCESSORS)), np.empty((*order, SUCCESSORS), np.int32)
+    R = np.empty(order)
+    for a in range(ACTIONS):
+        at = np.s_[:, a] if by_state else a
+        p[at] = rng.random((size, SUCCESSORS))
+        s_next[at] = rng.integers(0, size, (size, SUCCESSORS), dtype=np.int32)
+        R[at] = rng.random(size)
+    p /= p.sum(axis=2, keepdims=True)
+    rows = size * ACTIONS
     ends = np.arange(rows + 1, dtype=np.int32) * SUCCESSORS
-    P = sparse.csr_array((p.ravel(), s_next, ends), shape=(rows, size))
-    return P, rng.random((ACTIONS, size))
+    return sparse.csr_array((p.ravel(), s_next.ravel(), ends), shape=(rows, size)), R
 
 
 def their_mdp(size: int):
     """The same as a DiscreteDP of state-action pairs, compiled."""
     from quantecon.markov import DiscreteDP  # here, for the peak memory of ours is without it
 
-    P, R = our_mdp(size)
+    P, R = random_mdp(size, by_state=True)
     pairs = np.repeat(np.arange(size), ACTIONS), np.tile(np.arange(ACTIONS), size)
-    by_state = pairs[1] * size + pairs[0]  # its order: the actions of a state stand together
-    ddp = DiscreteDP(R.ravel()[by_state], sparse.csr_matrix(P[by_state]), DISCOUNT, *pairs)
+    ddp = DiscreteDP(R.ravel(), sparse.csr_matrix(P), DISCOUNT, *pairs)
     ddp.solve("value_iteration", max_iter=1)
     return ddp
 
@@ -73,7 +78,7 @@ def their_mdp(size: int):
 def bellman_sweeps(size: int, number: int) -> list[float]:
     """Median seconds of a sweep, ours and theirs, in turns of ten in one process."""
     script = importlib.import_module("value_iteration")
-    (P, R), ddp = our_mdp(size), their_mdp(size)
+    (P, R), ddp = random_mdp(size), their_mdp(size)
     V, V_next = np.random.default_rng(1).random(size), np.empty(size)
     sweeps = (lambda: script.backup(P, R, V, DISCOUNT).max(axis=0),
               lambda: ddp.bellman_operator(V, Tv=V_next))  # fmt: skip
@@ -92,7 +97,7 @@ def bellman_sweeps(size: int, number: int) -> list[float]:
 def our_solve(what: str, size: int) -> tuple[float, int, np.ndarray]:
     """Seconds, iterations and V."""
     what = what.removeprefix("modified_")
-    script, (P, R) = importlib.import_module(what), our_mdp(size)
+    script, (P, R) = importlib.import_module(what), random_mdp(size)
     began, iterations = time.perf_counter(), 1
     if what == "value_iteration":
         # QuantEcon's rule for a change of V; ours is relative to |V|, which is at most 1 / (1 - γ)
@@ -126,7 +131,7 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-def apart(limit: float | None, function, *arguments):
+def apart(limit: float, function, *arguments):
     """The function's result and its peak memory, from a process of its own; None: given up."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         try:
@@ -152,15 +157,19 @@ def main(args: Args) -> None:
     """Print one line for each measurement."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "quantecon"))
     print(f"{cpu_name()}; Python {platform.python_version()}, {versions}")
+    given_up = f"given up after {args.limit:g} s, or out of memory"
     for size in args.sizes:
         print(f"{size:,} states")
-        (ours, theirs), _ = apart(None, bellman_sweeps, size, args.sweeps)
-        times = f"{1e3 * ours:.3g} ms; QuantEcon {1e3 * theirs:.3g} ms"
-        print(f"  bellman_sweep: {times}; ratio {ours / theirs:.2g}", flush=True)
+        text, sweeps = given_up, apart(args.limit, bellman_sweeps, size, args.sweeps)
+        if sweeps:
+            (ours, theirs), _ = sweeps
+            text = f"{1e3 * ours:.3g} ms; QuantEcon {1e3 * theirs:.3g} ms"
+            text += f"; ratio {ours / theirs:.2g}"
+        print(f"  bellman_sweep: {text}", flush=True)
         for what in args.solves:
             found = in_turns(args.limit, what, size)
             for who, one in zip(("", "QuantEcon "), found, strict=True):
-                text = f"given up after {args.limit:g} s, or out of memory"
+                text = given_up
                 if one:
                     (seconds, iterations, _), memory = one
                     text = f"{seconds:.3g} s, {iterations} iterations, {memory:.2f} GB"

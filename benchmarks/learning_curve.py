@@ -44,8 +44,8 @@ def main(args: Args) -> None:
         axes.errorbar(evaluations.frames, evaluations.score_mean,
                       np.sqrt(evaluations.score_variance),
                       fmt="o", markersize=4, color="tab:orange", capsize=3,
-                      label=f"evaluation, {run['environment_evaluation_episodes']} games: mean, "
-                            "standard deviation")
+                      label=f"evaluation, up to {run['environment_evaluation_episodes']} games: "
+                            "mean, standard deviation")
     if (args.run_dir / "test.json").exists():
         test = json.loads((args.run_dir / "test.json").read_text())
         if test["scores"]:  # else no game of the test ended
