@@ -89,19 +89,20 @@ def run_script(dqn, args: Args, turns: Turns | None, **flags) -> None:
             env_id=args.env_id, device="cpu", runs_dir=folder, agent_replay_buffer_initial=FILLED,
             environment_train_frames_max=WARM_UP + args.frames, environment_test_frames=1,
             environment_evaluation_interval_episodes=10**9,  # an evaluation has a bar of its own
-            checkpoint_interval_minutes=1e9,
+            checkpoint_interval_minutes=1e9,  # none falls into a turn
             agent_epsilon_greedy_annealing=FILLED, **flags))
 
 
 def make_old(optimizer: torch.optim.Optimizer, linear: torch.nn.Linear) -> None:
-    """As after a run of hours: half of the units of `linear` dead, their moments denormal."""
+    """As after a run of hours: half of the units of `linear` dead, their moments denormal: written
+    as bits, as floats might be flushed on the way."""
     for group in optimizer.param_groups:
         for θ in group["params"]:
             θ.grad = torch.zeros_like(θ)
     optimizer.step()  # makes the moments
     linear.bias.data[::2] = -1e4  # such a unit is 0 in every state, and gets no gradient
     for moments in ("exp_avg", "exp_avg_sq"):
-        optimizer.state[linear.weight][moments].view(torch.int32)[::2] = 700_000  # is 1e-39
+        optimizer.state[linear.weight][moments].view(torch.int32)[::2] = 700_000  # 1e-39
 
 
 def ours(args: Args, turns: Turns, old: bool = False, **flags) -> None:
