@@ -9,7 +9,7 @@ r"""Deep Q-Learning with many simulators, many processes and many GPUs (ECE 544N
 §7.3.2): dqn_atari.py, which waits for one simulator, made parallel. New are make_simulator,
 ReplayShare, epsilon_greedy_batch, passed, learn and main; the rest is dqn_atari.py's, word for
 word. It drops exact resume, the lock on a run, checksums, RMSProp, --threads, the choice of the
-precision, all curves but those of games, and of test.json all but the summary and the scores.
+precision, all curves but those of games, and of test.json the speeds and the last evaluations.
 [8] is Mnih et al., Nature 518 (2015). The flags up to --optimizer-learning-rate are Table 3's.
 
     simulators       | s, a -> r, s' | s, a -> r, s' |    N, each in a process; a step: a frame each
@@ -314,10 +314,8 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
     env = TransformObservation(env, lambda screen: cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), None)
     env = TransformObservation(env, lambda grey: cv2.resize(grey, size), pixels)
     env = RecordEpisodeStatistics(env)  # a game's raw score, and its length in frames
-    if training:
-        limit = args.environment_reward_clip_limit
-        env = LifeLoss(ClipReward(env, -limit, limit))
-    return env
+    limit = args.environment_reward_clip_limit
+    return LifeLoss(ClipReward(env, -limit, limit)) if training else env
 
 
 def make_simulator(args: Args, no_op_rng: np.random.Generator, learner_pid: int) -> gym.Env:
@@ -340,7 +338,9 @@ class ReplayShare:
     mixes episodes or simulators; arrays are made when a minibatch is drawn (§7.3.2)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
-        self.capacity, self.shape, self.device, self.added = capacity, shape, device, 0
+        self.capacity, self.shape, self.added = capacity, shape, 0
+        # The program does not wait for its copies to an NVIDIA GPU. (For MPS that is not safe.)
+        self.transfer = {"device": device, "non_blocking": device == "cuda"}
         self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
 
@@ -361,7 +361,7 @@ class ReplayShare:
         # The frames that s and s' share are decompressed twice: once is no quicker.
         s = self.decode(self.frames[indices, :-1])  # (B, 4, 84, 84)
         s_next = self.decode(self.frames[indices, 1:])  # (B, 4, 84, 84)
-        a, r, terminal = torch.from_numpy(self.numbers[indices]).to(self.device).unbind(dim=1)
+        a, r, terminal = torch.from_numpy(self.numbers[indices]).to(**self.transfer).unbind(dim=1)
         return s, a.long(), r, s_next, terminal.bool()
 
     def decode(self, histories: Sequence[tuple]) -> torch.Tensor:
@@ -372,7 +372,7 @@ class ReplayShare:
         joined = [b"".join(map(lz4.block.decompress, xs)) for xs in zip(*histories, strict=True)]
         tall = [np.frombuffer(pixels, np.uint8).reshape(-1, self.shape[2]) for pixels in joined]
         states = cv2.merge(tall).reshape(-1, *self.shape[1:], self.shape[0])  # (B, 84, 84, 4)
-        return torch.from_numpy(states).to(self.device).permute(0, 3, 1, 2)  # (B, 4, 84, 84)
+        return torch.from_numpy(states).to(**self.transfer).permute(0, 3, 1, 2)  # (B, 4, 84, 84)
 
 
 # ---- network -------------------------------------------------------------------------------------
@@ -401,6 +401,15 @@ class QNetwork(nn.Module):
         # In training, autocast may have switched the layers to bfloat16; Q stays float32.
         with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float())  # (B, num_actions)
+
+
+class OneDNNLinear(nn.Linear):
+    """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
+    it does for convolutions. PyTorch's choice, MKL, takes nearly twice as long on an AMD EPYC."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
+        return super().forward(x.to_mkldnn() if onednn and len(x) > 1 else x).to_dense()
 
 
 def initialize_orthogonal(q_network: QNetwork) -> None:
@@ -432,8 +441,7 @@ def epsilon_greedy(q_network, state: torch.Tensor, epsilon: float, rng) -> int:
 def epsilon_greedy_batch(q_network, states: torch.Tensor, epsilon: float, rng) -> np.ndarray:
     """`epsilon_greedy` for each of the states (N, 4, 84, 84) uint8: N actions from one batch."""
     random = rng.integers(q_network.head.out_features, size=len(states))  # (N,)
-    greedy = q_network(states).argmax(dim=1).cpu().numpy()  # (N,)
-    return np.where(rng.random(len(states)) < epsilon, random, greedy)
+    return np.where(rng.random(len(states)) < epsilon, random, q_network(states).argmax(1).cpu())
 
 
 def update(q_network, target_network, optimizer, minibatch, discount: float, precision: str):
@@ -481,8 +489,7 @@ def evaluate(args: Args, q_network: QNetwork, decode: Callable, number: int) -> 
     exploration_rng, no_op_rng = np.random.default_rng([args.seed, number + 1]).spawn(2)
     env = FrameHistory(make_env(args, no_op_rng, training=False), args.agent_history_length)
     state, _ = env.reset(seed=args.seed + number)
-    finished = []
-    epsilon = args.agent_epsilon_greedy_epsilon_evaluation
+    finished, epsilon = [], args.agent_epsilon_greedy_epsilon_evaluation
     for _ in tqdm(range(args.environment_test_frames), "evaluation", leave=False, mininterval=1):
         action = epsilon_greedy(q_network, decode([state]), epsilon, exploration_rng)
         state, _, terminated, truncated, info = env.step(action)
@@ -548,6 +555,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
+    q_network.layers[7].__class__ = OneDNNLinear  # quicker products, the same weights
     optimizer = torch.optim.Adam(q_network.parameters(), args.optimizer_learning_rate, fused=True)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
@@ -555,20 +563,19 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[])
 
     parts = {"q_network": q_network, "target_network": target_network, "optimizer": optimizer}
+    name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
     if args.resume:
-        path = Path(args.resume) / "checkpoint.pt"
-        try:
-            saved = torch.load(path, map_location="cpu", weights_only=True)  # runs nothing in it
+        try:  # weights_only: nothing in the file is run
+            saved = torch.load(run_dir / "checkpoint.pt", map_location="cpu", weights_only=True)
             for name, part in parts.items():
                 part.load_state_dict(saved[name])
             vars(counters).update(saved["counters"])
         except Exception as error:  # a damaged file can raise anything
-            raise SystemExit(f"error: {path} cannot be resumed from: {error!r:.200}") from None
+            raise SystemExit(f"error: {run_dir} cannot be resumed from: {error!r:.200}") from None
     # The same θ, under a wrapper that averages the gradients of all ranks in backward().
     shared_network = DistributedDataParallel(q_network) if ranks > 1 else q_network
     if rank == 0:
-        name = f"{args.env_id}__dqn_atari_parallel__{args.seed}__{time.strftime('%Y%m%d-%H%M%S')}"
-        run_dir = Path(args.resume or Path(args.runs_dir) / name.replace("/", "-"))
         run_dir.mkdir(parents=True, exist_ok=bool(args.resume))
         text = json.dumps(vars(args) | {"resume": ""}, indent=2)
         write_file(run_dir / "args.json", lambda path: path.write_text(text))
@@ -626,8 +633,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
         for i in range(args.num_simulators):
             # After an end x[i] is the next episode's first frame (AutoresetMode.SAME_STEP, in
             # main), and the last frame of s' is in info.
-            frame = info["final_obs"][i] if ended[i] else x[i]
-            s_next = (*s[i][1:], lz4.block.compress(frame))
+            s_next = (*s[i][1:], lz4.block.compress(info["final_obs"][i] if ended[i] else x[i]))
             replay.add(s[i], a[i], r[i], s_next, terminated[i])
             s[i] = (lz4.block.compress(x[i]),) * args.agent_history_length if ended[i] else s_next
 
@@ -673,9 +679,10 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)  # all is saved: the test may be cut off
     if rank == 0 and not (stopping or signals):
-        finished, _ = evaluate(args, q_network, replay.decode, number=0)
-        test = summary(counters, finished) | {"scores": [score for score, _ in finished]}
+        finished, unfinished = evaluate(args, q_network, replay.decode, number=0)
+        test = summary(counters, finished) | {"unfinished_score_and_length": unfinished}
         print("\n".join(f"{name:32}{value}" for name, value in test.items()))
+        test |= {"scores": [score for score, _ in finished], "lengths": [n for _, n in finished]}
         text = json.dumps(test, indent=2).replace("NaN", "null")  # JSON has no NaN
         write_file(run_dir / "test.json", lambda path: path.write_text(text))
     if ranks > 1:
@@ -726,5 +733,4 @@ if __name__ == "__main__":
         main(read_args())
     # A full disk; a simulator that dies as it starts; Ctrl-C before or after the loop.
     except (OSError, EOFError, MemoryError, KeyboardInterrupt) as error:
-        text = str(error) or "interrupted, out of memory, or a simulator has died"
-        raise SystemExit(f"error: {text}") from None
+        raise SystemExit(f"error: {str(error) or 'interrupted, or a simulator has died'}") from None

@@ -216,6 +216,15 @@ def milliseconds(call, repeats: int = 300, before=lambda: None) -> float:
     return total / repeats * 1e3
 
 
+def make_network(num_actions: int = 6):
+    """The network as main of dqn_atari.py makes it on a CPU."""
+    import dqn_atari as dqn
+
+    q_network = dqn.QNetwork(4, 84, 84, num_actions).to(memory_format=torch.channels_last)
+    q_network.layers[7].__class__ = dqn.OneDNNLinear
+    return q_network
+
+
 def parts(args: Args) -> dict[str, float]:
     """Milliseconds of each part of a frame in dqn_atari.py."""
     import ale_py
@@ -225,8 +234,7 @@ def parts(args: Args) -> dict[str, float]:
     rng = np.random.default_rng(0)
     env = dqn.FrameHistory(dqn.make_env(script_args, rng, training=True), 4)
     replay = dqn.ReplayMemory(FILLED, (4, 84, 84), "cpu")
-    q_network = dqn.QNetwork(4, 84, 84, int(env.action_space.n))
-    q_network.to(memory_format=torch.channels_last)
+    q_network = make_network(int(env.action_space.n))
     target_network = copy.deepcopy(q_network).requires_grad_(False)
     optimizer = dqn.make_optimizer(script_args, q_network)
     s, _ = env.reset(seed=1)
@@ -266,7 +274,7 @@ def old_adam_step(flush: bool) -> float:
     import dqn_atari as dqn
 
     torch.set_flush_denormal(flush)
-    q_network = dqn.QNetwork(4, 84, 84, num_actions=6)
+    q_network = make_network()
     optimizer = dqn.make_optimizer(dqn.Args(), q_network)
     return milliseconds(optimizer.step, 100, lambda: make_old(optimizer, q_network.layers[7]))
 
@@ -290,8 +298,8 @@ def choose_precision() -> str:
     import dqn_atari
 
     torch.set_flush_denormal(True)
-    q_network = dqn_atari.QNetwork(4, 84, 84, 6).to(memory_format=torch.channels_last)
-    return dqn_atari.choose_precision(dqn_atari.Args(device="cpu"), q_network, (4, 84, 84))
+    args = dqn_atari.Args(device="cpu")
+    return dqn_atari.choose_precision(args, make_network(), (4, 84, 84))
 
 
 def compare_replay_ratios(args: Args) -> None:

@@ -185,6 +185,7 @@ def test_counts_of_updates_target_copies_first_weights_and_epsilon(train, freque
     for update in updates:  # the target is what the last update before the copy left
         left = [past.after for past in updates if past.frame <= (update.frame - 1) // 50 * 50]
         assert torch.equal(update.target, left[-1] if left else first.head.weight)
+    assert type(updates[0].network.layers[7]) is dqn.OneDNNLinear
     for i in (0, 2, 4):
         for weight in (first.layers[i].weight, updates[0].network.layers[i].weight):
             assert weight.is_contiguous(memory_format=torch.channels_last)
@@ -395,19 +396,26 @@ def test_update_in_bfloat16_is_close_to_float32():
     s, s_next = torch.randint(0, 256, (2, 32, 4, 84, 84), dtype=torch.uint8, generator=rng)
     r = torch.randint(-1, 2, (32,), generator=rng).float()
     minibatch = s, torch.arange(32) % 6, r, s_next, r < 0
-    results, dtypes = {}, []
-    for precision in ("float32", "bfloat16"):
+    results, dtypes, ways = [], [], []
+    linear, onednn = nn.Linear, dqn.OneDNNLinear
+    for precision, kind in (("float32", linear), ("float32", onednn), ("bfloat16", onednn)):
         q = copy.deepcopy(network)
+        q.layers[7].__class__ = kind
+        assert torch.equal(q(s[:1]), network(s[:1]))  # one state is never oneDNN's
         q.layers[2].register_forward_hook(lambda *arguments: dtypes.append(arguments[-1].dtype))
+        q.layers[7].register_forward_hook(lambda _, x, y: ways.append(str(y.grad_fn)[1:6]))
         sgd = torch.optim.SGD(q.parameters(), lr=1)
         loss, values = dqn.update(q, copy.deepcopy(network), sgd, minibatch, 0.99, precision)
         assert values.dtype == loss.dtype == torch.float32
         assert all(θ.dtype == θ.grad.dtype == torch.float32 for θ in q.parameters())
-        results[precision] = values, torch.cat([θ.grad.flatten() for θ in q.parameters()])
-    assert dtypes == [torch.float32, torch.bfloat16]
+        results.append((values, torch.cat([θ.grad.flatten() for θ in q.parameters()])))
+    assert dtypes == [torch.float32, torch.float32, torch.bfloat16]
+    assert ways[1:] == ["ToDen" if torch.backends.mkldnn.is_available() else "Addmm", "Addmm"]
     dqn.update(q, q, sgd, minibatch, 0.99, "bfloat16")  # without a target network
     assert all(θ.grad.any() for θ in q.parameters())
-    (q_32, gradient_32), (q_16, gradient_16) = results.values()
+    (q_32, gradient_32), (q_onednn, gradient_onednn), (q_16, gradient_16) = results
+    assert torch.allclose(q_32, q_onednn, atol=1e-5)
+    assert torch.allclose(gradient_32, gradient_onednn, rtol=1e-3, atol=1e-5)
     assert torch.allclose(q_32, q_16, atol=0.02) and not torch.equal(q_32, q_16)
     assert torch.cosine_similarity(gradient_32, gradient_16, dim=0) > 0.99
     assert gradient_32.norm() > 20  # it is not clipped
@@ -499,7 +507,8 @@ def test_dead_units_are_0_in_all_states():
 
 
 def test_mean_variance_and_first_and_last_tenth_by_hand(tmp_path):
-    counters = dqn.Counters(frames=3, updates=2, episodes=1, seconds=1.25, speeds=[*range(20)])
+    counters = SimpleNamespace(frames=3, updates=2, episodes=1, seconds=1.25, evaluations=[],
+                               speeds=[*range(20)])
     row = dqn.summary(counters, [(1.0, 10), (4.0, 20), (7.0, 60)])
     assert row == {"frames": 3, "updates": 2, "episodes": 1, "score_mean": 4, "score_variance": 9,
                    "length_mean": 30, "length_variance": pytest.approx(700), "seconds": 1.2}
