@@ -23,5 +23,4 @@ def command_line(tmp_path):
         return subprocess.run(
             [sys.executable, str(ALGORITHMS / script), *map(str, flags)], cwd=tmp_path,
             capture_output=True, text=True, encoding="utf-8", timeout=timeout)
-
     return run

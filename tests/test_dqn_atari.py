@@ -61,7 +61,6 @@ def train(tmp_path, monkeypatch):
     def run(**flags):
         memories, updates, copies = [], [], []
         make, update, load = dqn.ReplayMemory, dqn.update, dqn.QNetwork.load_state_dict
-
         def seen(q_network, target_network, *rest):
             record = SimpleNamespace(frame=memories[0].added, network=q_network,
                                      target=target_network.head.weight.clone(),
@@ -71,7 +70,6 @@ def train(tmp_path, monkeypatch):
             record.after = q_network.head.weight.detach().clone()
             updates.append(record)
             return result
-
         runs = tmp_path / f"runs{len(list(tmp_path.iterdir()))}"
         with monkeypatch.context() as patch:
             patch.setattr(dqn, "ReplayMemory", lambda *a: memories.append(make(*a)) or memories[-1])
@@ -82,7 +80,6 @@ def train(tmp_path, monkeypatch):
                 copies.append(memories[0].added), load(network, θ)))
             dqn.main(dqn.Args(**SHORT | flags, runs_dir=str(runs)))
         return *runs.iterdir(), memories[0], updates, copies  # one run directory
-
     yield run
     torch.set_flush_denormal(False)
 
@@ -206,7 +203,6 @@ def test_a_game_against_the_bare_emulator(env_id, repeat, pool, limit, size):
     def naive_frame(screens: list[np.ndarray]) -> np.ndarray:  # by colour, luminance, bilinear
         grey = torch.tensor(np.max(screens[-pool:], axis=0) @ (0.299, 0.587, 0.114))
         return nn.functional.interpolate(grey[None, None], size, mode="bilinear")[0, 0].numpy()
-
     (state, _), (test_state, _) = train.reset(seed=5), test.reset(seed=5)
     ale.setFloat("repeat_action_probability", 0.0)
     ale.loadROM(ale_py.roms.get_rom_path(train.unwrapped._game))
@@ -256,7 +252,6 @@ def test_no_ops_are_0_to_30_from_the_seed():
     def no_ops(count: int, seed: int, **flags) -> list[int]:
         env = environment(False, seed=seed, **flags)
         return [(env.reset(), env.unwrapped.ale.getEpisodeFrameNumber())[1] for _ in range(count)]
-
     first = no_ops(150, 1)
     assert (min(first), max(first), len(set(first)) > 25) == (0, 30, True)
     assert first[:9] == no_ops(9, 1) != no_ops(9, 2)
@@ -273,6 +268,7 @@ def test_states_are_stacked_frames_laid_out_as_convolutions_read_them(length):
     s, _, _, s_next, _ = replay.gather(np.array([0, 0]))
     assert (s.numpy() == pixels[0]).all() and s.is_contiguous(memory_format=torch.channels_last)
     assert (s_next.numpy() == [*pixels[0, 1:], pixels[1, -1]]).all()
+    assert not dqn.ReplayMemory(1, (4, 44, 52), "mps").transfer["non_blocking"]  # corrupts there
 
 
 def test_replay_returns_what_was_acted_on(games_of_800):
@@ -479,7 +475,6 @@ def evaluated(monkeypatch):
         args = dqn.Args(environment_evaluation_episodes=games, environment_test_frames=frames,
                         seed=seed)
         return dqn.evaluate(args, network, decode, number), env.actions
-
     return run
 
 

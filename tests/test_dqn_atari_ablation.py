@@ -36,7 +36,6 @@ def run(tmp_path, monkeypatch):
         runs = tmp_path / f"{script.__name__}{len(list(tmp_path.iterdir()))}"
         script.main(script.Args(**SHORT | flags, runs_dir=str(runs)))
         return *runs.iterdir(), calls  # one run directory
-
     return call
 
 
@@ -77,7 +76,6 @@ def test_without_replay_buffer_the_minibatch_is_the_last_transitions(run, monkey
         stored.append((self.decode([s])[0], a, r, self.decode([s_next])[0], terminal))
         add(self, s, a, r, s_next, terminal)
         stored_when.append(len(stored))
-
     monkeypatch.setattr(ablation.ReplayMemory, "add", noted)
     _, calls = run(ablation, replay_buffer=False)
     ends = [n for n in stored_when if n >= 200 and n % 4 == 0]  # past 300 the memory wraps

@@ -44,7 +44,6 @@ class Run:
     def __init__(self, folder: Path, precision="float32", **flags):
         run, self.updates, self.steps, self.acted, self.evaluated = self, [], [], [], []
         make_memory, make_envs = parallel.ReplayShare, parallel.AsyncVectorEnv
-
         class Bar(parallel.tqdm):
             def update(self, n=1):
                 super().update(n)
@@ -72,7 +71,6 @@ class Run:
         def evaluate(args, q_network, decode, number):
             run.evaluated.append((q_network.head.weight.requires_grad, number))
             return serial.evaluate(args, q_network, decode, number)
-
         greedy = parallel.epsilon_greedy_batch
         with pytest.MonkeyPatch.context() as patch:
             spies = dict(AsyncVectorEnv=envs, tqdm=Bar, update=update,
@@ -95,7 +93,8 @@ def read_checkpoint(run_dir: Path) -> dict:
 def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     run = Run(tmp_path, num_simulators=simulators, environment_train_frames_max=400 * simulators,
               agent_replay_buffer_initial=2400, agent_replay_buffer_maximum_length=2400,
-              environment_evaluation_interval_episodes=5, seed=simulators)
+              environment_evaluation_interval_episodes=5, seed=simulators,
+              agent_epsilon_greedy_epsilon_evaluation=1.0, environment_test_frames=400)
     decode = serial.ReplayMemory(1, (4, 44, 52), "cpu").decode
     s, a, r, s_next, terminal = run.memory.gather(np.arange(400 * simulators))
     fresh = np.random.default_rng([simulators, 0, 0]).spawn(2 + simulators)
@@ -120,6 +119,8 @@ def test_every_transition_is_that_of_a_serial_replay(tmp_path, simulators):
     rows = next(tmp_path.glob("*/evaluations.csv")).read_text().count("\n") - 1
     assert (run.memory.added, run.result["episodes"], rows) == (len(s), len(ends), len(ends) // 5)
     assert run.evaluated == [(True, number) for number in (*range(1, rows + 1), 0)]
+    unfinished = run.result["unfinished_score_and_length"][1]
+    assert 0 < sum(run.result["lengths"]) == 400 - unfinished
     events = EventAccumulator(str(next(tmp_path.iterdir()))).Reload()
     found = [(event.step, event.value) for event in events.Scalars("charts/episodic_return")]
     assert sorted(found) == sorted(games)
@@ -166,9 +167,10 @@ RANK = """
 import os, sys, torch
 sys.path.insert(0, sys.argv.pop(1))
 import dqn_atari_parallel as parallel
-update, seen = parallel.update, []
+update, seen, make, capacities = parallel.update, [], parallel.ReplayShare, []
 def watched(q_network, target_network, optimizer, minibatch, *rest):
     seen.append({"pid": os.getpid(), "minibatch": minibatch, "tiny": float(torch.tensor(1e-39) / 2),
+                 "capacity": capacities[0],
                  "θ": [x.detach().clone() for x in q_network.parameters()],
                  "target": [x.clone() for x in target_network.parameters()]})
     result = update(q_network, target_network, optimizer, minibatch, *rest)
@@ -178,6 +180,7 @@ def watched(q_network, target_network, optimizer, minibatch, *rest):
     return result
 if __name__ == "__main__":
     parallel.update = watched
+    parallel.ReplayShare = lambda *a: capacities.append(a[0]) or make(*a)
     parallel.main(parallel.read_args())
 """
 
@@ -254,7 +257,8 @@ def test_ranks_stop_together_resume_and_have_one_θ_and_the_mean_gradient(tmp_pa
     for mine, yours in zip(logs[0] + first, logs[1] + second, strict=True):
         for name in ("θ", "gradient", "target"):
             assert all(map(torch.equal, mine[name], yours[name])), name
-        assert mine["tiny"] == 0 and not torch.equal(mine["minibatch"][0], yours["minibatch"][0])
+        assert mine["tiny"] == 0 and mine["capacity"] == yours["capacity"] == 2000 // 2
+        assert not torch.equal(mine["minibatch"][0], yours["minibatch"][0])
         both = [torch.cat(pair) for pair in zip(mine["minibatch"], yours["minibatch"], strict=True)]
         assert len(both[0]) == 8
         for network, name in zip(networks, ("θ", "target"), strict=True):

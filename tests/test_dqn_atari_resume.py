@@ -88,8 +88,7 @@ def everything(run_dir: Path) -> dict:
     replay = dqn.ReplayMemory(SHORT["agent_replay_buffer_maximum_length"], (4, 44, 52), "cpu")
     replay.load_state_dict(saved.pop("replay"))
     rows = [row.rsplit(",", 1)[0] for row in (run_dir / "evaluations.csv").read_text().splitlines()]
-    test = json.loads((run_dir / "test.json").read_text())
-    args = json.loads((run_dir / "args.json").read_text())
+    args, test = [json.loads((run_dir / f"{x}.json").read_text()) for x in ("args", "test")]
     return plain(saved) | {
         "replay": (replay.added, replay.frames.tolist(), replay.numbers.tobytes()), "rows": rows,
         "test": {name: test[name] for name in ("scores", "lengths", "updates")},
@@ -193,7 +192,6 @@ def test_the_emulator_goes_on_where_it_was(game, tmp_path):
         names = "lives", "episode_returns", "episode_lengths"
         return [state, reward, terminated, ale.getScreenRGB().tobytes(), ale.getRAM().tobytes(),
                 ale.getEpisodeFrameNumber(), *map(env.get_wrapper_attr, names)]
-
     rewards = [play(one, int(rng.integers(one.action_space.n)))[1] for _ in range(120)]
     assert min(rewards) == -(game == "Pong")  # a lost point is -1
     torch.save(dqn.environment_state(one), tmp_path / "state")
@@ -213,7 +211,6 @@ def test_two_processes_cannot_write_one_run(straight, tmp_path):
             before = {path: path.read_bytes() for path in only(tmp_path).iterdir()}
             seen.append(child(0, 0, "--resume", only(tmp_path)))
             assert {path: path.read_bytes() for path in only(tmp_path).iterdir()} == before
-
     assert run(runs_dir=tmp_path, each_frame=meanwhile) == 0
     assert seen[0].returncode == 1 and seen[0].stderr.count("\n") == 1, seen[0].stderr
     assert everything(only(tmp_path)) == straight[1]
@@ -292,7 +289,6 @@ def test_a_weight_that_is_not_finite_ends_the_run_and_is_in_no_checkpoint(
         if frames[-1] >= frame:
             torch.nn.init.constant_(q_network.layers[0].bias, torch.nan)
         return loss_and_q
-
     monkeypatch.setattr(dqn, "update", broken)
     code = run(runs_dir=tmp_path, each_frame=frames.append)
     saved = torch.load(only(tmp_path) / "checkpoint.pt", weights_only=True)

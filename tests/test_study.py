@@ -65,7 +65,6 @@ def study(tmp_path):
         done = subprocess.run([*command, *flags], cwd=tmp_path, capture_output=True, text=True)
         runs = [json.loads(line) for line in (tmp_path / "calls").read_text().splitlines()]
         return done.returncode, done.stdout, runs
-
     return call
 
 
