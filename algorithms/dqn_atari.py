@@ -27,7 +27,7 @@ Measured, on two cores of an AMD EPYC, mean score of the final test, one seed
     Breakout, --environment-train-frames-max 560000 --agent-update-frequency 4
     --agent-epsilon-greedy-epsilon-final 0.02 --agent-epsilon-greedy-annealing 250000
     --agent-replay-buffer-initial 20000, bfloat16: 41.71 after 29 minutes (the lecture: 32.154;
-    the last two evaluations: 33.9, 33.3). Pong, 7500000 frames: 19.19 after 7 hours (19.083)
+    the last two evaluations: 33.9, 33.3). Pong, 7500000 frames, else the same: 19.19 (19.083)
 
 Deviations
     lecture or [8]                        this file                           why
@@ -329,7 +329,8 @@ class ReplayMemory:
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.added = capacity, shape, 0
-        # The program does not wait for its copies to an NVIDIA GPU. (For MPS that is not safe.)
+        # PyTorch need not wait until a copy has ended: before .to() returns, CUDA has taken
+        # ordinary memory into a buffer of its own. (MPS has not.)
         self.transfer = {"device": device, "non_blocking": device == "cuda"}
         self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
@@ -420,7 +421,8 @@ class QNetwork(nn.Module):
 
 class OneDNNLinear(nn.Linear):
     """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
-    it does for convolutions. PyTorch's choice, MKL, takes nearly twice as long on an AMD EPYC."""
+    it does for convolutions. PyTorch leaves them to MKL, which is slower on an AMD EPYC. Other CPUs
+    were not timed."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
@@ -681,14 +683,14 @@ def main(args: Args) -> None:
     q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)  # quicker convolutions
-    q_network.layers[7].__class__ = OneDNNLinear  # quicker products, the same weights
+    q_network.layers[7].__class__ = OneDNNLinear  # the linear layer: the same weights, quicker
     if args.precision == "auto":
         args.precision = choose_precision(args, copy.deepcopy(q_network), shape)
     optimizer = make_optimizer(args, q_network)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
     # 5-7  ε is computed from the frame, in the loop; the rest is counted.
-    # Of the rest, `seconds` lack the pauses between stop and resume, `evaluations` are the rows of
+    # `seconds` is without the pauses between stop and resume; `evaluations` holds the rows of
     # evaluations.csv, `speeds` the frames a second of every REPORT_INTERVAL.
     counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[],
                                      speeds=[])
@@ -708,7 +710,7 @@ def main(args: Args) -> None:
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Frames are slower once learning starts, at {args.agent_replay_buffer_initial:,}.")
-    loss = q = torch.tensor(math.nan)  # () until the first update
+    loss = q = torch.tensor(math.nan)  # () until the first update, of a resumed run, too
 
     def save_q_network() -> None:
         """What it takes to play."""
@@ -749,7 +751,8 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        # A game is over: RecordEpisodeStatistics is inside LifeLoss. The names are CleanRL's.
+        # A game, not only a life, is over: RecordEpisodeStatistics, which writes "episode", is
+        # inside LifeLoss. The curves' names are CleanRL's.
         if "episode" in info:
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)

@@ -24,7 +24,7 @@ Run it
     python benchmarks/study.py tables                               # Tables 4 to 6 so far
 
 Measured, Breakout, 500,000 frames, other flags as dqn_atari.py's run, mean score of the final test
-    no switch 33.55, --no-target-network 17.30, --no-replay-buffer 2.029, both 6.789
+    no switch 33.55, --no-target-network 17.30, --no-replay-buffer 2.029, both switches 6.789
 
 Deviations
     The lecture does not say what "no replay buffer" trains on. Here it is the most recent
@@ -320,7 +320,8 @@ class ReplayMemory:
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.added = capacity, shape, 0
-        # The program does not wait for its copies to an NVIDIA GPU. (For MPS that is not safe.)
+        # PyTorch need not wait until a copy has ended: before .to() returns, CUDA has taken
+        # ordinary memory into a buffer of its own. (MPS has not.)
         self.transfer = {"device": device, "non_blocking": device == "cuda"}
         self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
@@ -411,7 +412,8 @@ class QNetwork(nn.Module):
 
 class OneDNNLinear(nn.Linear):
     """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
-    it does for convolutions. PyTorch's choice, MKL, takes nearly twice as long on an AMD EPYC."""
+    it does for convolutions. PyTorch leaves them to MKL, which is slower on an AMD EPYC. Other CPUs
+    were not timed."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
@@ -700,7 +702,7 @@ def main(args: Args) -> None:
     q_network = QNetwork(*shape, len(actions))
     initialize(q_network, args.initialization)
     q_network.to(args.device, memory_format=torch.channels_last)  # quicker convolutions
-    q_network.layers[7].__class__ = OneDNNLinear  # quicker products, the same weights
+    q_network.layers[7].__class__ = OneDNNLinear  # the linear layer: the same weights, quicker
     if args.precision == "auto":
         args.precision = choose_precision(args, copy.deepcopy(q_network), shape)
     optimizer = make_optimizer(args, q_network)
@@ -710,7 +712,7 @@ def main(args: Args) -> None:
         target_network = q_network
     held_out = held_out_states(args, replay.decode)  # (500, 4, 84, 84)
     # 5-7  ε is computed from the frame, in the loop; the rest is counted.
-    # Of the rest, `seconds` lack the pauses between stop and resume, `evaluations` are the rows of
+    # `seconds` is without the pauses between stop and resume; `evaluations` holds the rows of
     # evaluations.csv, `speeds` the frames a second of every REPORT_INTERVAL.
     counters = types.SimpleNamespace(frames=0, updates=0, episodes=0, seconds=0.0, evaluations=[],
                                      speeds=[])
@@ -730,7 +732,7 @@ def main(args: Args) -> None:
     writer = SummaryWriter(run_dir, purge_step=counters.frames + 1 if args.resume else None)
     print(f"{args.env_id}: {' '.join(actions)}; {args.precision} on {args.device}; {run_dir}")
     print(f"Frames are slower once learning starts, at {args.agent_replay_buffer_initial:,}.")
-    loss = q = torch.tensor(math.nan)  # () until the first update
+    loss = q = torch.tensor(math.nan)  # () until the first update, of a resumed run, too
 
     def save_q_network() -> None:
         """What it takes to play."""
@@ -771,7 +773,8 @@ def main(args: Args) -> None:
         episode_ended = terminated or truncated
         counters.episodes += episode_ended
         s = env.reset()[0] if episode_ended else s_next
-        # A game is over: RecordEpisodeStatistics is inside LifeLoss. The names are CleanRL's.
+        # A game, not only a life, is over: RecordEpisodeStatistics, which writes "episode", is
+        # inside LifeLoss. The curves' names are CleanRL's.
         if "episode" in info:
             writer.add_scalar("charts/episodic_return", info["episode"]["r"], counters.frames)
             writer.add_scalar("charts/episodic_length", info["episode"]["l"], counters.frames)

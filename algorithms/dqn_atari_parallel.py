@@ -26,7 +26,7 @@ Run it
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
 Measured, on two cores of an AMD EPYC, bfloat16, one update in four
-    frames a second: 370 with 8 simulators, 390 with 16; dqn_atari.py 338, most of it learning
+    frames a second (by an earlier commit): 370 with 8 simulators, 390 with 16; dqn_atari.py 338
     Breakout, 1,050,000 frames, other flags as dqn_atari.py's run: 60.84 after 58 minutes
 
 Deviations, beside those of dqn_atari.py
@@ -339,7 +339,8 @@ class ReplayShare:
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.added = capacity, shape, 0
-        # The program does not wait for its copies to an NVIDIA GPU. (For MPS that is not safe.)
+        # PyTorch need not wait until a copy has ended: before .to() returns, CUDA has taken
+        # ordinary memory into a buffer of its own. (MPS has not.)
         self.transfer = {"device": device, "non_blocking": device == "cuda"}
         self.frames = np.empty((capacity, shape[0] + 1), object)  # x_{t-3} … x_{t+1}: LZ4 bytes
         self.numbers = np.zeros((capacity, 3), np.float32)  # a, r, terminal: one array to send
@@ -405,7 +406,8 @@ class QNetwork(nn.Module):
 
 class OneDNNLinear(nn.Linear):
     """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
-    it does for convolutions. PyTorch's choice, MKL, takes nearly twice as long on an AMD EPYC."""
+    it does for convolutions. PyTorch leaves them to MKL, which is slower on an AMD EPYC. Other CPUs
+    were not timed."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
@@ -555,7 +557,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     q_network = QNetwork(*shape, len(actions))
     initialize_orthogonal(q_network)
     q_network.to(args.device, memory_format=torch.channels_last)
-    q_network.layers[7].__class__ = OneDNNLinear  # quicker products, the same weights
+    q_network.layers[7].__class__ = OneDNNLinear  # the linear layer: the same weights, quicker
     optimizer = torch.optim.Adam(q_network.parameters(), args.optimizer_learning_rate, fused=True)
     # 4  θ⁻ = θ
     target_network = copy.deepcopy(q_network).requires_grad_(False)
@@ -731,6 +733,6 @@ if __name__ == "__main__":
     sys.stdout.reconfigure(encoding="utf-8", line_buffering=True)
     try:
         main(read_args())
-    # A full disk; a simulator that dies as it starts; Ctrl-C before or after the loop.
+    # A full disk or memory; a simulator that dies as it starts; Ctrl-C before or after the loop.
     except (OSError, EOFError, MemoryError, KeyboardInterrupt) as error:
-        raise SystemExit(f"error: {str(error) or 'interrupted, or a simulator has died'}") from None
+        raise SystemExit(f"error: {str(error) or 'Ctrl-C, no memory, or simulator died'}") from None

@@ -14,8 +14,8 @@ Run it
     python algorithms/value_iteration.py --model my_mdp.json --discount 0.95 --output-json best.json
 
 Measured
-    The first command converges in 4 sweeps to V* = (11, 1, 4) and π* = (a1, a1, a2). FrozenLake-v1
-    at discount 1: V(0) = 0.8235294117, 14/17, after 993 sweeps.
+    The first command converges in 4 sweeps to V* = (11, 1, 4) and π* = (a1, a1, a2). FrozenLake-v1,
+    4×4, at discount 1: V(0) = 0.8235294117, 14/17, after 993 sweeps.
 
 Deviations
     §3 and §4 are undiscounted; here a reward t steps later counts γ^t (--discount).

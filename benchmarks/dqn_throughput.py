@@ -10,9 +10,10 @@ processes of their own that take turns, 384 frames each while the others wait: a
 machine, whose speed may drift. Our scripts are run whole, as their users run them;
 Stable-Baselines3's DQN (float32) with its CnnPolicy and its own Atari wrappers, with as many
 environments as there are simulators. All are on the CPU and warm up for 5,000 frames without
-learning and 1,144 with: until a run has freed a large block of memory, the C library of Linux gives
-an update's memory back to the system after each, and page faults are timed that a run of hours
-hardly has.
+learning and 1,144 with. Until a process has freed a large block of memory, the C library of Linux
+gives an update's memory back to the system after each, at the price of page faults. Our runs free
+such a block in the first 2,000 frames; Stable-Baselines3 does not, so it is timed as it comes, and
+once more after freeing one.
 
 A run of hours can slow down where a benchmark of seconds does not, so a run is also timed whose
 optimizer is old: half of the linear layer's units dead, and their moments denormal numbers; and
@@ -144,8 +145,10 @@ def ours_parallel(args: Args, turns: Turns | None, ranks: int, rank: int = 0, **
     run_script(dqn_atari_parallel, args, turns if ranks == 1 else None, **flags)
 
 
-def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1) -> None:
-    """Run its DQN; a call of its callback is a frame of each environment."""
+def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1,
+                      free: bool = False) -> None:
+    """Run its DQN; a call of its callback is a frame of each environment. `free`: after freeing a
+    block of 30 MB."""
     from stable_baselines3 import DQN
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_atari_env
@@ -156,6 +159,8 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
             turns.step(envs)
             return True
 
+    if free:
+        torch.empty(30 * 2**20, dtype=torch.uint8)
     same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
     env = make_atari_env(f"ale_py:{args.env_id}", n_envs=envs, seed=1, env_kwargs=same_game,
                          vec_env_cls=SubprocVecEnv if envs > 1 else None)  # ale_py is imported
@@ -217,7 +222,7 @@ def milliseconds(call, repeats: int = 300, before=lambda: None) -> float:
 
 
 def make_network(num_actions: int = 6):
-    """The network as main of dqn_atari.py makes it on a CPU."""
+    """The network as main of dqn_atari.py lays it out on a CPU."""
     import dqn_atari as dqn
 
     q_network = dqn.QNetwork(4, 84, 84, num_actions).to(memory_format=torch.channels_last)
@@ -258,7 +263,7 @@ def parts(args: Args) -> dict[str, float]:
     frame = milliseconds(step, FILLED)
     emulator = milliseconds(emulate, 2_000)
     minibatch = replay.gather(rng.integers(len(replay), size=32))
-    return {
+    times = {
         "emulate (the bare emulator)": emulator,
         "preprocess, compress, store": frame - emulator,
         "act": milliseconds(lambda: dqn.epsilon_greedy(q_network, replay.decode([s]), 0.0, rng)),
@@ -267,6 +272,9 @@ def parts(args: Args) -> dict[str, float]:
         "update, bfloat16": milliseconds(lambda: update("bfloat16")),
         "of it Adam's step": milliseconds(optimizer.step),
     }
+    for network in (q_network, target_network):
+        network.layers[7].__class__ = torch.nn.Linear
+    return times | {"update, float32, linear layer by MKL": milliseconds(lambda: update("float32"))}
 
 
 def old_adam_step(flush: bool) -> float:
@@ -309,6 +317,7 @@ def compare_replay_ratios(args: Args) -> None:
         same = {"agent_update_frequency": frequency}
         columns.append(side_by_side(args, {
             "Stable-Baselines3": (stable_baselines3, same),
+            "Stable-Baselines3, a block freed": (stable_baselines3, same | {"free": True}),
             "dqn_atari.py, float32": (ours, same | {"precision": "float32"}),
             "dqn_atari.py, float32, old": (ours, same | {"precision": "float32", "old": True}),
             f"dqn_atari.py, auto: {precision}": (ours, same | {"precision": precision}),
