@@ -26,7 +26,7 @@ Run it
         --rdzv-endpoint MACHINE1:29400 algorithms/dqn_atari_parallel.py    # on both machines
 
 Measured, on two cores of an AMD EPYC, bfloat16, one update in four
-    frames a second (by an earlier commit): 370 with 8 simulators, 390 with 16; dqn_atari.py 338
+    frames a second: 335 with 8 simulators, 350 with 16; dqn_atari.py 307, most of it learning
     Breakout, 1,050,000 frames, other flags as dqn_atari.py's run: 60.84 after 58 minutes
 
 Deviations, beside those of dqn_atari.py
@@ -406,8 +406,8 @@ class QNetwork(nn.Module):
 
 class OneDNNLinear(nn.Linear):
     """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
-    it does for convolutions. PyTorch leaves them to MKL, which is slower on an AMD EPYC. Other CPUs
-    were not timed."""
+    it does for convolutions. PyTorch leaves them to MKL: on an AMD EPYC an update takes 16 % longer
+    (benchmarks/dqn_throughput.py). Other CPUs were not timed."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
