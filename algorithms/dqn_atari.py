@@ -7,8 +7,8 @@
 # ///
 r"""Deep Q-Learning on Atari games (ECE 544NA, Lecture 27, §5.3 and §7, Algorithm 6): the method of
 Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), here [8].
-The algorithm is `update` and the loop of `main`; all else serves them. The flags up to
---optimizer-learning-rate are Table 3's, in its order; those from --env-id on are this script's own.
+The algorithm is `update` and the loop of `main`; all else serves them. The flags are Table 3's, in
+its order, up to --optimizer-learning-rate, and this script's own from --env-id on.
 
 Run it
     python algorithms/dqn_atari.py --env-id PongNoFrameskip-v4     # Table 3, 10 million frames
@@ -323,9 +323,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 class ReplayMemory:
     """𝒟: the last `capacity` transitions (§5.3). Each has references to its own 5 frames (s' is s
-    moved on by one), an action, a clipped reward, and whether s' is terminal. A row's neighbours
-    can be of other games. Arrays are made when a minibatch is drawn (§7.3.2). `shape` is that of a
-    state, (4, 84, 84)."""
+    moved on by one), an action, a clipped reward, and whether s' is terminal. It takes none from
+    its neighbours, which can be of other games. Arrays are made when a minibatch is drawn (§7.3.2).
+    `shape` is that of a state, (4, 84, 84)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.added = capacity, shape, 0
@@ -460,7 +460,7 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
     Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,)."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        # Q(s_j, a_j; θ)
+        # Q(s_j, a_j; θ): of the values of s_j that of a_j
         q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
         # y_j = r_j                                     if s_{j+1} is terminal

@@ -6,8 +6,8 @@
 # ]
 # ///
 r"""Deep Q-Learning on Atari games, taken apart (ECE 544NA, Lecture 27, §7.5, Tables 4 and 6):
-dqn_atari.py with three switches; `diff dqn_atari.py dqn_atari_ablation.py` shows them. To
---optimizer-learning-rate the flags are Table 3's, then come the switches, from --env-id this
+dqn_atari.py with three switches; `diff dqn_atari.py dqn_atari_ablation.py` shows them. The flags
+are Table 3's up to --optimizer-learning-rate, then come the switches, then, from --env-id on, this
 script's own.
 
     --initialization default|he|orthogonal   convolution weights (Table 4)
@@ -314,9 +314,9 @@ def make_env(args: Args, no_op_rng: np.random.Generator, training: bool) -> gym.
 
 class ReplayMemory:
     """𝒟: the last `capacity` transitions (§5.3). Each has references to its own 5 frames (s' is s
-    moved on by one), an action, a clipped reward, and whether s' is terminal. A row's neighbours
-    can be of other games. Arrays are made when a minibatch is drawn (§7.3.2). `shape` is that of a
-    state, (4, 84, 84)."""
+    moved on by one), an action, a clipped reward, and whether s' is terminal. It takes none from
+    its neighbours, which can be of other games. Arrays are made when a minibatch is drawn (§7.3.2).
+    `shape` is that of a state, (4, 84, 84)."""
 
     def __init__(self, capacity: int, shape: tuple[int, int, int], device: str):
         self.capacity, self.shape, self.added = capacity, shape, 0
@@ -455,7 +455,7 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
     Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,)."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        # Q(s_j, a_j; θ)
+        # Q(s_j, a_j; θ): of the values of s_j that of a_j
         q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
         # y_j = r_j                                     if s_{j+1} is terminal

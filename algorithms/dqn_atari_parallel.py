@@ -452,7 +452,7 @@ def update(q_network, target_network, optimizer, minibatch, discount: float, pre
     Adam stay float32. Returns the mean loss () and Q(s_j, a_j) (B,)."""
     s, a, r, s_next, terminal = minibatch
     with torch.autocast(s.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        # Q(s_j, a_j; θ)
+        # Q(s_j, a_j; θ): of the values of s_j that of a_j
         q = q_network(s).gather(1, a.unsqueeze(1)).squeeze(1)  # (B,)
 
         # y_j = r_j                                     if s_{j+1} is terminal
