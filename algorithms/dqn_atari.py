@@ -421,8 +421,9 @@ class QNetwork(nn.Module):
 
 class OneDNNLinear(nn.Linear):
     """nn.Linear; for speed alone, on a CPU oneDNN computes the float32 products of a minibatch, as
-    it does for convolutions. PyTorch leaves them to MKL: on an AMD EPYC an update takes 16 % longer
-    (benchmarks/dqn_throughput.py). Other CPUs were not timed."""
+    it does for convolutions. PyTorch leaves them to MKL: on an AMD EPYC an update takes 16 to 18 %
+    longer then (benchmarks/dqn_throughput.py). Other CPUs were not timed. For a single state it
+    hardly matters."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         onednn = torch.backends.mkldnn.is_available() and x.is_cpu and x.dtype == torch.float32
