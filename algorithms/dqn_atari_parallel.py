@@ -542,7 +542,7 @@ def learn(args: Args, envs, exploration_rng, minibatch_rng, rank: int, ranks: in
     torch.set_flush_denormal(True)
     # For speed alone, on Linux: once a block of 30 MB (at most 32) has been freed, the C library
     # keeps up to 60 MB that are free. Else it gives an update's memory back to the system, and the
-    # next one pays for that with page faults. (dqn_atari.py's dead_units frees such a block.)
+    # next one pays for that with page faults.
     torch.empty(30 * 2**20, dtype=torch.uint8)
 
     # 1  Initialize the Atari 2600 simulators; simulator i of all has the seed `seed` + i.

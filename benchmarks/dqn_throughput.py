@@ -12,8 +12,8 @@ Stable-Baselines3's DQN (float32) with its CnnPolicy and its own Atari wrappers,
 environments as there are simulators. All are on the CPU and warm up for 5,000 frames without
 learning and 1,144 with. Until a process has freed a large block of memory, the C library of Linux
 gives an update's memory back to the system after each, at the price of page faults. Our runs free
-such a block in the first 2,000 frames; Stable-Baselines3 does not, so it is timed as it comes, and
-once more after freeing one.
+such a block at their start; Stable-Baselines3 does not, so it is timed as it comes, and once more
+after freeing one.
 
 A run of hours can slow down where a benchmark of seconds does not, so a run is also timed whose
 optimizer is old: half of the linear layer's units dead, and their moments denormal numbers; and
@@ -145,10 +145,15 @@ def ours_parallel(args: Args, turns: Turns | None, ranks: int, rank: int = 0, **
     run_script(dqn_atari_parallel, args, turns if ranks == 1 else None, **flags)
 
 
+def free_a_block() -> None:
+    """Of 30 MB, as our runs do at their start."""
+    torch.empty(30 * 2**20, dtype=torch.uint8)
+
+
 def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, envs: int = 1,
                       free: bool = False) -> None:
-    """Run its DQN; a call of its callback is a frame of each environment. `free`: after freeing a
-    block of 30 MB."""
+    """Run its DQN; a call of its callback is a frame of each environment. `free`: after
+    `free_a_block`."""
     from stable_baselines3 import DQN
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_atari_env
@@ -160,7 +165,7 @@ def stable_baselines3(args: Args, turns: Turns, agent_update_frequency: int, env
             return True
 
     if free:
-        torch.empty(30 * 2**20, dtype=torch.uint8)
+        free_a_block()
     same_game = {"frameskip": 1, "repeat_action_probability": 0.0}
     env = make_atari_env(f"ale_py:{args.env_id}", n_envs=envs, seed=1, env_kwargs=same_game,
                          vec_env_cls=SubprocVecEnv if envs > 1 else None)  # ale_py is imported
@@ -295,9 +300,9 @@ def in_a_process(call, *args):
 
 def flushed_parts(args: Args) -> dict[str, float]:
     """`parts` as in a run: denormal numbers flushed before the first parallel work, and a large
-    block of memory freed before, which a run of dqn_atari.py does when it counts dead units."""
+    block of memory freed."""
     torch.set_flush_denormal(True)
-    torch.empty(30 * 2**20, dtype=torch.uint8)
+    free_a_block()
     return parts(args)
 
 
@@ -306,6 +311,7 @@ def choose_precision() -> str:
     import dqn_atari
 
     torch.set_flush_denormal(True)
+    free_a_block()
     args = dqn_atari.Args(device="cpu")
     return dqn_atari.choose_precision(args, make_network(), (4, 84, 84))
 
